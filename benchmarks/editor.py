@@ -1,14 +1,21 @@
-"""Times of the editor as a browser sees them: start, first picture, a moved view, a moved object.
+"""Times of the editor as a browser sees them: start, first picture, a moved view, a dragged object and its light.
 
-`python benchmarks/editor.py [COUNT ...]`. For targets of 200,000 Gaussians (or COUNT) it starts `splatgraft edit` on a
+`python benchmarks/editor.py [--against SRC] [COUNT ...]`. With another checkout's `src` both are measured, one after
+the other. For targets of 200,000 Gaussians (or COUNT) it starts `splatgraft edit` on a
 project of two synthetic scenes, the target of SH degree 3, and speaks the page's own protocol through a websocket, at a
 canvas of 1280x720. No browser takes part, so what a browser needs for drawing comes on top. Times are seconds from the
 message that causes a picture to its arrival, medians of REPEATS; `final` is the light as the step computes it. Of a
-large scene the first points are of a sample.
+large scene the first points are of a sample. A drag is of DRAG_SECONDS: by the requests of the page's script where the
+page has one, else by its gizmo; `draft` and `final` after it count from the release.
 """
 
+import argparse
 import contextlib
+import html
+import http.client
+import json
 import os
+import re
 import statistics
 import subprocess
 import sys
@@ -17,6 +24,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlencode, urlsplit
 
 import msgspec
 import numpy as np
@@ -34,6 +42,7 @@ from splatgraft.formats import write_gaussians
 from splatgraft.project.toml_edit import with_keys
 
 WIDTH, HEIGHT, REPEATS, HANG_LIMIT = 1280, 720, 5, 600.0
+DRAG_SECONDS = 3.0
 BALL_BOX = [-0.35, -0.35, 0.02, 0.35, 0.35, 0.75]
 
 
@@ -64,6 +73,7 @@ class Client:
     def __init__(self, address: str) -> None:
         """Connect; nothing is sent yet."""
         base, _, query = address.partition("/?")
+        self.address = address
         self._socket: ClientConnection = connect(
             base.replace("http", "ws") + "/?" + query,
             origin=base,  # pyright: ignore[reportArgumentType]
@@ -139,6 +149,24 @@ class Client:
         """What the page says about the picture."""
         return " ".join(str(p.get("content")) for p in self._gui.values() if "sg-caption" in str(p.get("content")))
 
+    def script_state(self) -> dict[str, Any]:
+        """What the page's script was told last; empty where the page has none."""
+        for props in self._gui.values():
+            found = re.search(r'class="sg-state"[^>]*>([^<]*)<', str(props.get("content")))
+            if found:
+                return json.loads(html.unescape(found[1]))
+        return {}
+
+    def ask(self, what: str, **query: Any) -> bytes:
+        """A request of the page's script."""
+        parts = urlsplit(self.address)
+        connection = http.client.HTTPConnection(parts.netloc, timeout=HANG_LIMIT)
+        given = urlencode({"window": self.script_state()["window"], **query})
+        connection.request("GET", f"/hand/{what}?{given}&{parts.query}")
+        answer = connection.getresponse()
+        assert answer.status in (200, 204), answer.read()
+        return answer.read()
+
     def until(self, condition: Callable[[], bool]) -> float:
         """Seconds until a condition holds."""
         start = time.monotonic()
@@ -168,10 +196,11 @@ def is_final(client: Client) -> bool:
     return "Light transfer" in caption and "draft" not in caption and "computing" not in caption
 
 
-def measure(project: Path) -> dict[str, float]:
+def measure(project: Path, source: Path | None) -> dict[str, float]:
     start, found = time.monotonic(), {}
+    environment = os.environ | {"PYTHONUNBUFFERED": "1"} | ({} if source is None else {"PYTHONPATH": str(source)})
     words = [sys.executable, "-m", "splatgraft", "edit", str(project), "--port", "18400", "--keep-closed"]
-    server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONUNBUFFERED": "1"})
+    server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment)
     try:
         assert server.stdout is not None
         client = Client(server.stdout.readline().strip())
@@ -192,6 +221,7 @@ def measure(project: Path) -> dict[str, float]:
         found |= {"moved view": statistics.median([_turn(client, 0.3 * (k + 1)) for k in range(REPEATS)])}
         found |= {"moved object": statistics.median([_move(client, k) for k in range(REPEATS)])}
         found["final after a move"] = client.until(lambda: is_final(client))
+        found |= _drag(client)
     finally:
         server.terminate()
         server.wait(60)
@@ -206,6 +236,38 @@ def _turn(client: Client, angle: float) -> float:
     return client.picture()
 
 
+def _drag(client: Client) -> dict[str, float]:
+    """Pictures a second during a drag, and the seconds from its end to the draft of the light and to the light."""
+    client.until(lambda: is_final(client))
+    pictures, start = 0, time.monotonic()
+    if client.script_state():
+        for _ in client.messages(1.0):
+            pass
+        start = time.monotonic()
+        client.ask("grab", object=0, mode="move", x=0.5, y=0.5)
+        while (at := time.monotonic() - start) < DRAG_SECONDS:
+            assert client.ask("drag", x=0.5 + 0.02 * at, y=0.5 + 0.01 * at)
+            pictures += 1
+        client.ask("drop", x=0.5 + 0.02 * DRAG_SECONDS, y=0.5 + 0.01 * DRAG_SECONDS)
+    else:
+        position, wxyz = np.array(client.value("Position")), [1.0, 0.0, 0.0, 0.0]
+        client.send("TransformControlsDragStartMessage", name="/gizmo")
+        while (at := time.monotonic() - start) < DRAG_SECONDS:
+            moved = (position + np.array([0.02 * at, 0.0, 0.0])).tolist()
+            client.send("TransformControlsUpdateMessage", name="/gizmo", position=moved, wxyz=wxyz)
+            pictures += sum(map(is_picture, client.messages(0.05)))
+        client.send("TransformControlsDragEndMessage", name="/gizmo")
+    end = time.monotonic()
+    client.until(lambda: "a draft of the light" in client.caption())
+    draft = time.monotonic() - end
+    client.until(lambda: is_final(client))
+    return {
+        "pictures a second in a drag": pictures / DRAG_SECONDS,
+        "draft after it": draft,
+        "final after it": time.monotonic() - end,
+    }
+
+
 def _move(client: Client, k: int) -> float:
     client.until(lambda: is_final(client))
     x, y, z = client.value("Position")
@@ -217,8 +279,15 @@ def _move(client: Client, k: int) -> float:
 
 
 if __name__ == "__main__":
-    counts = [int(word) for word in sys.argv[1:]] or [200_000]
-    for count in counts:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--against", type=Path)
+    parser.add_argument("counts", nargs="*", type=int, default=[200_000])
+    given = parser.parse_args()
+    for count in given.counts:
         with tempfile.TemporaryDirectory() as folder:
-            times = measure(write_project(Path(folder), count))
-        print(f"{count:,} Gaussians: " + ", ".join(f"{name} {seconds:.2f} s" for name, seconds in times.items()))
+            made = write_project(Path(folder), count)
+            sources = {"now": None} if given.against is None else {"before": given.against, "now": None}
+            for name, source in sources.items():
+                times = measure(made, source)
+                rows = ", ".join(f"{what} {value:.2f}" for what, value in times.items())
+                print(f"{count:,} Gaussians, {name}: {rows}", flush=True)

@@ -218,9 +218,18 @@ class Window:
 
     def show_phase(self, phase: str) -> None:
         """Switch to a phase."""
-        button = self.page.get_by_role("button", name=re.compile(f"^(\u25cf )?{phase}$"))
+        button = self.phase_button(phase)
         current = self.page.get_by_role("button", name=f"\u25cf {phase}", exact=True)
         self.act_until(lambda: self.click_on(button), current.is_visible, what=f"the phase {phase}")
+
+    def phase_button(self, phase: str) -> Any:
+        """The button of a phase, whatever mark it has."""
+        return self.page.get_by_role("button", name=re.compile(rf"^(\S )?{phase}$")).first
+
+    def show_more(self) -> None:
+        """Open what the phases do not show at first."""
+        inner = self.page.get_by_text("View", exact=True)
+        self.act_until(lambda: self.unfold("More"), inner.is_visible, what="the further controls")
 
     def inputs(self, label: str) -> Any:
         """All inputs in the row of a label."""

@@ -30,6 +30,11 @@ def phase_of(page: Page, name: str) -> Any:
     return cast("Any", page.phases[name])
 
 
+def mark_of(page: Page, phase: str) -> str:
+    """What stands before the name of a phase."""
+    return next(option for option in page._phase_buttons.options if option.endswith(phase)).partition(" ")[0]
+
+
 def status(page: Page) -> str:
     return page.context.status.content
 
@@ -81,9 +86,13 @@ def test_the_object_s_height_is_shown_and_typed_in_centimetres(page: Page) -> No
     base = session.placeable_object(0).base
     # without scales it says how to get them
     assert not size._height.visible
-    assert "splatgraft scale" in size._note.content
+    assert "what the project says: 0.8 times" in size._note.content
+    sends(place._scale, 1.0)
+    assert "type the object's true height" in html.unescape(size._note.content)
+    assert session.undo()
+    page.refresh()
     for height in (0.0, -1.0, math.nan, math.inf):
-        for which in ("its capture", "the place"):
+        for which in ("its photos", "the place"):
             arrives(size._known, height)
             sends(size._set, which)
             assert "height in cm: expected a number from" in status(page)
@@ -110,7 +119,7 @@ def test_the_object_s_height_is_shown_and_typed_in_centimetres(page: Page) -> No
     # with the other scale the object gets its true size
     assert not size._true_size.visible
     arrives(size._known, 24.0)
-    sends(size._set, "its capture")
+    sends(size._set, "its photos")
     assert session.objects()[0].target_from_object.scale == pytest.approx(2.0 * before.scale)
     assert size._height.value == pytest.approx(24.0, abs=0.01)
     assert "24 cm tall" in size._note.content
@@ -189,6 +198,9 @@ def drag(handler: Any, handle: Any, *, position: Any = None, wxyz: Any = None) -
 
 def test_drags_move_turn_and_scale_with_and_without_snapping(page: Page) -> None:
     place, session = phase_of(page, "Place"), page.context.require_session()
+    # the pointer drags the object itself until the handles are wanted
+    assert place._gizmo._move is None
+    sends(place._has_gizmo, True)
     gizmo, foot = place._gizmo, session.placeable_object(0).base.point
     before = session.objects()[0].target_from_object
     stands = before.points(foot)
@@ -326,13 +338,14 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
     assert main(["run", str(project), "--to", "consolidate"]) == 0
     with opened_page(project) as page:
         run, session = phase_of(page, "Run"), page.context.require_session()
-        share = run._share
-        assert not run._stale.visible
-        assert run._transfer.label == "Harmonise and consolidate"
+        assert "The result is up to date" in run._note.content
+        share = phase_of(page, "Share")
+        assert not share._stale.visible
+        assert mark_of(page, "Run") == "\u2713"
         session.change(replace(session.state, weights=LayerWeights(shadow=0.5)))
         page.refresh()
-        assert "relight: " in run._stale.content
-        assert run._transfer.label == "Bring the result up to date"
+        assert "The result is out of date: relight: " in share._stale.content
+        assert mark_of(page, "Run") == "\u21bb"
         sends(share._kind, "Scene, exact (.ply)")
         is_handled(share._write)
         wait_until(lambda: share._bar.visible, what="the progress of the export")
@@ -350,19 +363,21 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
         assert "the result is out of date" in page.preview._caption.content
         assert session.undo()
         page.refresh()
-        assert not run._stale.visible
+        assert not share._stale.visible
         placed = session.objects()[0].target_from_object
         session.set_placement(0, replace(placed, translation=placed.translation + 0.01))
         page.refresh()
-        assert "out of date (you moved the object)" in run._stale.content
-        assert "you moved the object" in run._steps.content
+        assert "out of date: you moved the object" in share._stale.content
+        phase_of(page, "Run")
+        assert "out of date: you moved the object" in run._note.content
 
 
 def test_a_picture_that_was_begun_before_select_is_not_shown_there(page: Page) -> None:
     page.show_phase("Place")
     request = page.preview._request()
     assert request is not None
-    window = MagicMock(spec=ClientHandle, client_id=1, scene=MagicMock(), _websock_connection=MagicMock())
+    parts = {name: MagicMock() for name in ("scene", "gui", "_websock_connection")}
+    window = MagicMock(spec=ClientHandle, client_id=1, **parts)
     late = replace(
         request, window=window, camera=request.camera.resized(0.2), left="Target alone", right="Target alone"
     )

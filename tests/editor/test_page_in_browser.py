@@ -27,9 +27,9 @@ from tiny_project import ball, plane
 from splatgraft.cli import main
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.gaussians import concatenate
-from splatgraft.editor.page.page import Page
-from splatgraft.editor.page.photo_clicks import PhotoView
+from splatgraft.editor.page.page import PHASES, Page
 from splatgraft.editor.page.scene_view import camera_from_viser
+from splatgraft.editor.photo_view import PhotoView
 from splatgraft.editor.placement import rescale
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
@@ -40,7 +40,6 @@ from splatgraft.relighting import LightSource, light_to_json
 from splatgraft.relighting.light.sun import SET_BY_HAND
 
 PANEL_PX = 372
-PHASES = ("Open", "Select", "Place", "Light", "Run")
 DRAFT = "a draft of the light"
 
 
@@ -68,7 +67,7 @@ def wait_for_the_full_light(window: Window) -> None:
 
 
 def picture_of(window: Window) -> np.ndarray:
-    window.show_phase("Run")
+    window.show_phase("Share")
     picture = np.asarray(Image.open(window.download("Picture of this view")).convert("RGB"))
     window.show_phase("Place")
     wait_for_the_full_light(window)
@@ -96,24 +95,26 @@ def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window
     window.page.keyboard.press("Home")
     begun = page.context.cameras()[0].centers[0].numpy()
     window.until(lambda: float(np.abs(camera.position - begun).max()) < 1e-3, what="the first view again")
-    # what flies the camera does nothing else
+    # no key flies the camera
+    for key in ("w", "a", "s", "d", "q", "e"):
+        window.page.keyboard.down(key)
+    window.page.wait_for_timeout(500)
+    for key in ("w", "a", "s", "d", "q", "e"):
+        window.page.keyboard.up(key)
+    assert float(np.abs(camera.position - begun).max()) < 1e-3
     count = len(session.objects())
-    window.page.keyboard.press("d")
-    window.page.keyboard.press("s")
     window.page.keyboard.press("Control+d")
     window.until(lambda: len(session.objects()) == count + 1, what="a second object")
     assert not page.phases["Place"]._snap.value
     window.page.keyboard.press("Control+z")
     window.until(lambda: len(session.objects()) == count, what="one object again")
-    # without the canvas the window shows splats, which have one colour per Gaussian and no light
-    window.check("Draw on the canvas", False)
-    window.until(lambda: difference(window, second) > 3, what="splats")
     color = np.array([90, 140, 200])
 
     def of_cameras() -> int:
         return int((abs(screen(window) - color).sum(-1) < 60).sum())
 
     before = of_cameras()
+    window.show_more()
     window.check("Show the cameras")
     window.until(lambda: of_cameras() > before + 500, what="cameras in view")
     # a second window is told that it only watches, and edits when the first one is closed
@@ -124,7 +125,7 @@ def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window
     window.page.close()
     other.page.get_by_text(notice).wait_for(state="detached")
     other.show_phase("Run")
-    other.says("not made yet")
+    other.says("There is no result yet")
     assert window.unknown_errors() == other.unknown_errors() == []
     other.page.close()
 
@@ -146,7 +147,7 @@ def test_an_arrow_of_the_light_is_dragged_under_drafts(browser: Any, project: Pa
     with opened_page(project) as page:
         window = Window.opened(browser, address_of(page))
         window.show_phase("Light")
-        window.says("sun 53")
+        window.says("Set by hand: sun")
         wait_for_the_full_light(window)
 
         def drag_and_release() -> None:
@@ -208,6 +209,24 @@ def test_two_clicks_set_the_sun_and_undo_takes_it_back(browser: Any, tmp_path: P
         window.undo_until(
             project, lambda: (now := state_of(project).light) is not None and now.sources == LIGHT.sources
         )
+        # a light is dragged on the picture of the sky, to overhead
+        dot, sky = (window.page.locator(f".sg-dome{part}").first for part in (" .sg-light", ""))
+
+        def drag_to_the_middle() -> None:
+            begin, whole = dot.bounding_box(), sky.bounding_box()
+            start = (begin["x"] + begin["width"] / 2, begin["y"] + begin["height"] / 2)
+            middle = (whole["x"] + whole["width"] / 2, whole["y"] + whole["height"] / 2)
+            window.drag(start, (middle[0] - start[0], middle[1] - start[1]))
+
+        def height() -> float:
+            light = state_of(project).light
+            return 0.0 if light is None else light.sources[0].direction[2]
+
+        window.act_until(drag_to_the_middle, lambda: height() > 0.995, what="a light overhead")
+        window.says("Set by hand: sun from overhead")
+        window.page.keyboard.press("Control+z")
+        window.until(lambda: height() < 0.9, what="the light where it was")
+        wait_for_the_full_light(window)
         # a point on the shadow first, which is refused
         click_at(window, page, tops[0] - sun * 1.0)
         window.says("now click the same point of its shadow")
@@ -229,7 +248,8 @@ def test_two_clicks_on_the_demo_s_table_give_its_known_sun_and_a_shadow_as_dark_
         window = Window.opened(browser, address_of(page))
         window.show_phase("Light")
         # both are in view there
-        window.write("Camera", "24")
+        window.show_more()
+        window.write("Photo", "25")
         found = set_the_sun(window, page, [(rim, shadow)])
         window.page.close()
     assert found.name == SET_BY_HAND
@@ -247,7 +267,7 @@ def test_strokes_and_clicks_in_a_photo_select_the_object(window: Window, project
         return (0, 0) if found is None else (int((found > 0).sum()), int((found < 0).sum()))
 
     window.show_phase("Select")
-    window.says("80 of 224 Gaussians are the object")
+    window.says("The object is orange")
 
     def drag_a_rectangle() -> None:
         # over the left part of the image, in the middle of the canvas
@@ -266,6 +286,7 @@ def test_strokes_and_clicks_in_a_photo_select_the_object(window: Window, project
     window.act_until(lambda: window.drag((422, 430), (100, 40)), lambda: strokes()[1] > one, what="a stroke")
     window.page.keyboard.press("b")
     window.says("the brush is off")
+    window.show_more()
     window.check("Second box")
     window.click("Add")
     # the box begins a tenth larger than the object's, and adds what was removed in it
@@ -279,10 +300,7 @@ def test_strokes_and_clicks_in_a_photo_select_the_object(window: Window, project
 def click_into_a_photo(window: Window, project: Path) -> None:
     capture = read_capture(project.parent / "source" / "capture")
     name, photo = capture.cameras.names[1], Image.open(capture.image_paths[1]).convert("RGB")
-    window.unfold("Points in photos")
-    window.check("Show a photo")
     window.write("Photo", "2")
-    window.says(name)
     canvas = window.page.locator("canvas").first.bounding_box()
     view = PhotoView(photo.size, (round(canvas["width"]), round(canvas["height"])))
     left, top = view.corner
@@ -301,7 +319,7 @@ def click_into_a_photo(window: Window, project: Path) -> None:
     window.act_until(
         lambda: window.page.mouse.click(*at), lambda: state_of(project).prompts is not None, what="a point in the file"
     )
-    window.says("1 on the object, 0 beside it")
+    window.says("1 click in 1 of the photos")
     prompts = state_of(project).prompts
     assert prompts is not None
     assert list(prompts) == [name]
@@ -309,8 +327,127 @@ def click_into_a_photo(window: Window, project: Path) -> None:
     assert prompts[name].inside[0].tolist() == pytest.approx(spot, abs=1.5 / view.scale)
     window.page.keyboard.press("Control+z")
     window.until(lambda: state_of(project).prompts is None, what="the click undone")
-    window.check("Show a photo", False)
+    # the view leaves the photo, and a click on the object in the scene counts in a photo that shows it
+    window.drag((200, 780), (60, 20))
     window.until(lambda: not is_shown(), what="the scene again")
+    window.act_until(
+        lambda: window.page.mouse.click(470, 450),
+        lambda: state_of(project).prompts is not None,
+        what="a click in the scene",
+    )
+    prompts = state_of(project).prompts
+    assert prompts is not None
+    assert sum(len(prompt.inside) for prompt in prompts.values()) == 1
+    window.page.keyboard.press("Control+z")
+    window.until(lambda: state_of(project).prompts is None, what="the click undone")
+
+
+def told(window: Window) -> dict[str, Any]:
+    """What the page's script was told with the picture, once that is there with the one before."""
+    window.page.locator(".sg-line").wait_for(state="visible")
+    return window.page.evaluate("JSON.parse(document.querySelector('.sg-state').textContent)")
+
+
+def middle_of_the_object(window: Window) -> tuple[float, float]:
+    canvas = window.page.locator("canvas").first.bounding_box()
+    x, y = np.array(told(window)["hulls"][0]).mean(0)
+    return canvas["x"] + x * canvas["width"], canvas["y"] + y * canvas["height"]
+
+
+def test_hands_move_turn_size_and_lift_the_object(window: Window, page: Page) -> None:
+    session = page.context.require_session()
+    foot = session.placeable_object(0).base.point
+    window.show_phase("Place")
+    wait_for_the_full_light(window)
+
+    def placed() -> Any:
+        return session.objects()[0].target_from_object
+
+    def hand(key: str | None, by: tuple[float, float]) -> Any:
+        """Drag the object, and wait until it is placed; gives the placement before."""
+        before, start = placed(), middle_of_the_object(window)
+        if key is not None:
+            window.page.keyboard.press(key)
+        window.drag(start, by, release=False)
+        # the canvas shows it while it is held, and nothing is saved
+        window.page.locator(".sg-drag").wait_for(state="visible")
+        assert placed() is before
+        window.page.mouse.up()
+        window.until(lambda: placed() is not before, what="a new placement")
+        wait_for_the_full_light(window)
+        return before
+
+    before = hand(None, (60, 30))
+    moved = placed().points(foot) - before.points(foot)
+    assert float(moved[:2].norm()) > 0.05
+    assert abs(float(moved[2])) < 0.05
+    assert placed().scale == before.scale
+    before = hand("r", (80, 0))
+    assert torch.allclose(placed().points(foot), before.points(foot), atol=1e-4)
+    assert float((placed().rotation - before.rotation).norm()) > 0.3
+    before = hand("s", (60, -40))
+    assert placed().scale > 1.1 * before.scale
+    before = hand("e", (0, -60))
+    assert float(placed().points(foot)[2] - before.points(foot)[2]) > 0.02
+    # Escape takes a drag back, and an arrow key is a small step
+    before = placed()
+    window.drag(middle_of_the_object(window), (50, 20), release=False)
+    window.page.keyboard.press("Escape")
+    window.page.mouse.up()
+    window.until(lambda: not window.page.locator(".sg-drag").is_visible(), what="the end of the drag")
+    assert placed() is before
+    window.page.keyboard.press("ArrowRight")
+    window.until(lambda: placed() is not before, what="a step to the right")
+    assert 0.001 < float((placed().translation - before.translation).norm()) < 0.1
+    # another window's number, and what is no number, change nothing
+    wait_for_the_full_light(window)
+    before, ours = placed(), told(window)["window"]
+    base, get = window.page.url.partition("?")[0].rstrip("/"), window.page.request.get
+    for number, query, status in (
+        (99, "object=0&mode=move&x=0.5&y=0.5", 403),
+        (ours, "object=7&mode=move&x=0.5&y=0.5", 400),
+        (ours, "object=0&mode=fly&x=0.5&y=0.5", 400),
+        (ours, "object=0&mode=move&x=nan&y=0.5", 400),
+        (ours, "object=0&mode=move", 400),
+    ):
+        assert get(f"{base}/hand/grab?window={number}&{query}").status == status
+    assert get(f"{base}/hand/drag?window={ours}&x=0.5&y=0.5").status == 400
+    assert get(f"{base}/hand/nothing?window={ours}").status == 404
+    assert placed() is before
+    assert window.unknown_errors() == []
+
+
+def test_the_divider_shows_the_picture_before_and_a_turning_view_is_never_black(window: Window) -> None:
+    mouse, line = window.page.mouse, window.page.locator(".sg-line")
+    window.show_phase("Place")
+    wait_for_the_full_light(window)
+    told(window)
+    lit = canvas_of(window)
+    rows, half = slice(100, -100), lit.shape[1] // 2
+    window.page.keyboard.down("Tab")
+    window.until(lambda: float(abs(canvas_of(window) - lit)[rows, 60:].max()) > 25, what="the picture before")
+    pasted = canvas_of(window)
+    window.page.keyboard.up("Tab")
+    box = line.bounding_box()
+    mouse.move(box["x"] + 14, box["y"] + 200)
+    mouse.down()
+    mouse.move(half, 300, steps=4)
+    mouse.up()
+
+    def is_half() -> bool:
+        return float(abs(canvas_of(window) - pasted)[rows, 60 : half - 30].mean()) < 2
+
+    window.until(is_half, what="the picture before, left of the divider")
+    assert float(abs(canvas_of(window) - lit)[rows, half + 30 :].mean()) < 2
+    mouse.move(200, 780)
+    mouse.down()
+    seen = []
+    for step in range(12):
+        mouse.move(200 + 12 * step, 780 - 3 * step)
+        seen.append(float((canvas_of(window)[200:600, 200:600].max(-1) > 20).mean()))
+    mouse.up()
+    assert min(seen) > 0.3, seen
+    assert window.unknown_errors() == []
 
 
 def test_controls_fit_and_the_scene_is_seen_at_the_sizes_of_a_desktop_a_laptop_and_a_phone(window: Window) -> None:
@@ -319,11 +456,15 @@ def test_controls_fit_and_the_scene_is_seen_at_the_sizes_of_a_desktop_a_laptop_a
         page.set_viewport_size({"width": width, "height": height})
         for phase in PHASES:
             window.show_phase(phase)
-            names = [f"\u25cf {name}" if name == phase else name for name in PHASES]
-            buttons = [page.get_by_role("button", name=name, exact=True).first for name in names]
-            window.until(lambda buttons=buttons: all(one.is_visible() for one in buttons), what="the steps")
-            boxes = [one.bounding_box() for one in buttons]
-            assert len({round(box["y"]) for box in boxes}) == 1, f"the steps of {phase} wrap: {boxes}"
+            buttons = [window.phase_button(name) for name in PHASES]
+            boxes: list[Any] = []
+
+            def are_in_a_row(buttons: list[Any] = buttons, boxes: list[Any] = boxes) -> bool:
+                # the panel moves when the window has become narrow
+                boxes[:] = [one.bounding_box() if one.is_visible() else None for one in buttons]
+                return None not in boxes and len({round(box["y"]) for box in boxes}) == 1
+
+            window.until(are_in_a_row, what=f"the steps of {phase} in one row: {boxes}")
             assert boxes[0]["x"] >= 0
             assert boxes[-1]["x"] + boxes[-1]["width"] <= width
             assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -340,7 +481,9 @@ def test_controls_fit_and_the_scene_is_seen_at_the_sizes_of_a_desktop_a_laptop_a
 
 KEYS = (
     "g",
-    "d",
+    "w",
+    "r",
+    "e",
     "Control+d",
     "b",
     "s",
@@ -433,16 +576,19 @@ def test_the_whole_way_from_scene_files_to_the_shared_result(browser: Any, tmp_p
         place(window, project)
         light(window, project)
         window.show_phase("Run")
-        window.start_job(project, "Harmonise and consolidate")
+        window.start_job(project, "Update result")
         if killed:
             editor, window = kill_the_editor_during_a_job(window, browser, editor, project)
         window.finish_job(project)
         shared = share(window, project)
         if killed:
             as_by_commands(project, tmp_path, shared)
+        assert editor.end() == 0
+        # the page says that it has no editor any more, and does not call its state saved
+        window.page.locator("#sg-dead").wait_for(state="visible")
+        assert not window.page.locator(".sg-saved").is_visible()
         # else it would connect to the next editor at this port
         window.page.close()
-        assert editor.end() == 0
     finally:
         if editor.process.poll() is None:
             editor.kill()
@@ -465,7 +611,7 @@ def open_scenes(window: Window, browser: Any, editor: Editor, root: Path) -> Win
     state = jobs_of(project).state
     window.until(lambda: window.shows_job() or not ((job := state()) and job.live), what="the job on the page")
     window.finish_job(project)
-    window.says("224 Gaussians; without photographs")
+    window.says("ready, without photographs")
     assert (project.parent / "target" / "scene" / "scene.ply").read_bytes() == (root / "target.ply").read_bytes()
     # changes by hand while the editor is open are loaded
     text = project.read_text()
@@ -478,7 +624,8 @@ def open_scenes(window: Window, browser: Any, editor: Editor, root: Path) -> Win
 
 def select(window: Window, project: Path) -> None:
     window.show_phase("Select")
-    window.choose("Masks from", "no masks: everything inside the box")
+    window.show_more()
+    window.choose("Outlines from", "no masks: everything inside the box")
     window.check("Box around the object")
     window.until(lambda: state_of(project).box is not None, what="a box in project.toml")
     for label, first in (("Box to", 3), ("Box from", 0)):
@@ -490,7 +637,7 @@ def select(window: Window, project: Path) -> None:
 
             window.write_number(label, index, wanted, effect=is_saved)
     window.choose("Keep pieces", "all")
-    window.says("80 of 224 Gaussians are inside the box")
+    window.says("What is in the box is orange")
     window.start_job(project, "Cut out the object")
     window.says("Cut out the object: done")
     assert read_gaussians(project.parent / "object" / "object.ply").count == 80
@@ -523,7 +670,7 @@ def place(window: Window, project: Path) -> None:
 
 def light(window: Window, project: Path) -> None:
     window.show_phase("Light")
-    window.write("Shadow", "0.5", effect=lambda: state_of(project).weights.shadow == 0.5)
+    window.write("Shadow strength", "0.5", effect=lambda: state_of(project).weights.shadow == 0.5)
 
 
 def kill_the_editor_during_a_job(window: Window, browser: Any, editor: Editor, project: Path) -> tuple[Editor, Window]:
@@ -544,7 +691,7 @@ def kill_the_editor_during_a_job(window: Window, browser: Any, editor: Editor, p
 
 
 def share(window: Window, project: Path) -> bytes:
-    window.show_phase("Run")
+    window.show_phase("Share")
     window.choose("As", "Scene, exact (.ply)")
     shared = window.download("Write and download").read_bytes()
     window.says(" MB in ")

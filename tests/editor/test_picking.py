@@ -11,7 +11,7 @@ from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import read_upright
 from splatgraft.core.prompts import ViewPrompt
-from splatgraft.editor.page.photo_clicks import PhotoView, prompt_of, with_click
+from splatgraft.editor.photo_view import PhotoView, prompt_of, with_click
 from splatgraft.editor.picking import (
     Ray,
     Rectangle,

@@ -17,7 +17,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor import relit_preview
-from splatgraft.editor.pictures import PICTURE_KINDS, wipe_comparison
+from splatgraft.editor.pictures import PICTURE_KINDS
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import CoarseGaussians, coarsen, upsample_light
 from splatgraft.editor.session import Session
@@ -56,10 +56,6 @@ def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Ses
         assert picture.std() > 1, kind
     assert session.relighting.is_relit(state)
     assert not session.relighting.is_relit(moved(state))
-    picture, other = (session.pictures.view(kind, state, camera).pixels for kind in ("Copy-paste", "Target alone"))
-    both = wipe_comparison(picture, other, 0.25)
-    assert (both[:, :10] == picture[:, :10]).all()
-    assert (both[:, 20:] == other[:, 20:]).all()
 
 
 @pytest.mark.parametrize("light", [None, LIGHT])

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.history import History
-from splatgraft.editor.page.photo_clicks import with_click
+from splatgraft.editor.photo_view import with_click
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState

@@ -1,7 +1,7 @@
 """Pictures of the edited scene by splatgraft's renderer: pasted object, relit scene, result, and their layers."""
 
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import cv2
@@ -12,7 +12,9 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import read_upright
 from splatgraft.editor.memo import Memo
+from splatgraft.editor.photo_view import PhotoView, prompt_of
 from splatgraft.editor.relit_preview import RelitPreview, largest_coverage_indices
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState
@@ -26,12 +28,17 @@ PictureKind = Literal[
     "Shadow layer",
     "Photograph",
     "Source",
+    "Selection",
     "Object alone",
 ]
 PICTURE_KINDS: tuple[PictureKind, ...] = get_args(PictureKind)[:6]
 """Kinds of pictures of the target."""
-SOURCE_KINDS: tuple[PictureKind, PictureKind] = ("Source", "Object alone")
+SOURCE_KINDS: tuple[PictureKind, ...] = get_args(PictureKind)[6:]
 """Kinds of pictures of the source."""
+TINT = (1.0, 0.45, 0.1)
+"""sRGB color of what is selected."""
+_LONGEST_PX = 1920
+"""Longest side of a photo on the canvas, pixels; on a larger canvas the browser enlarges it."""
 NEEDS_LIGHT: tuple[PictureKind, ...] = ("Light transfer", "Shadow layer")
 """Kinds that need the light transfer."""
 
@@ -77,10 +84,48 @@ class Pictures:
             depth = torch.where(found.alpha[0] > 0.5, found.depth[0], torch.inf)
             return Picture(_bytes(found.color[0]), depth.numpy())
 
-    def source_view(self, which: Bool[Tensor, "n"] | None, camera: Cameras) -> Picture:
-        """Render the source scene, or the Gaussians selected by `which`."""
+    def of_source(
+        self, kind: PictureKind, state: EditState, which: Bool[Tensor, "n"] | None, camera: Cameras, photo: int | None
+    ) -> Picture:
+        """Render the source, or the Gaussians selected by `which` alone, or the source with them tinted.
+
+        Where `photo` is the number of a photo of the capture, it stands in place of the rendered picture, as large as
+        it fits, with what was clicked in it.
+        """
         scene = self._scenes.gaussians(self._scenes.files.source_scene)
-        return Picture(_bytes(render(scene if which is None else scene.select(which), camera).color[0]))
+        if kind == "Object alone":
+            return Picture(_bytes(render(scene if which is None else scene.select(which), camera).color[0]))
+        flags = None if kind == "Source" or which is None else which[:, None].to(scene.means)
+        if photo is None:
+            found = render(scene, camera, features=flags)
+            pixels = _bytes(found.color[0])
+            return Picture(pixels if flags is None else _tinted(pixels, found.features[0, ..., 0]))
+        capture = self._scenes.capture(self._scenes.files.source_cameras)
+        pixels, size = self.photo(photo)
+        view = PhotoView(size, (camera.width, camera.height))
+        if flags is not None:
+            width = view.drawn_size[0]
+            posed = capture.cameras[photo].resized(width / capture.cameras[photo].width)
+            share = render(scene, posed, outputs=frozenset(), features=flags).features[0, ..., 0].numpy()
+            share = cv2.resize(share, (pixels.shape[1], pixels.shape[0]), interpolation=cv2.INTER_LINEAR)
+            pixels = _tinted(pixels, torch.from_numpy(share))
+        return Picture(view.drawn(pixels, prompt_of(state.prompts, capture.cameras.names[photo])))
+
+    def photo(self, index: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
+        """A photo of the source, upright and at most 1920 pixels long, and its own width and height."""
+        path = self._scenes.capture(self._scenes.files.source_cameras).image_paths[index]
+        stamp = path.stat().st_mtime_ns if path.is_file() else 0
+        return self._scenes.derive("photo", (str(path), stamp), lambda: read_upright(path, _LONGEST_PX))
+
+    def without_object(self, state: EditState, index: int, camera: Cameras) -> Picture:
+        """The target with all objects but one, pasted: what stays the same while that one is dragged."""
+        objects = state.objects or ()
+        rest = replace(state, objects=(*objects[:index], *objects[index + 1 :]))
+        if not rest.objects:
+            return self.view("Target alone", rest, camera)
+        found = render(self._scenes.composite(rest).bake()[0], camera, outputs=frozenset({"color", "depth"}))
+        depth = torch.where(found.alpha[0] > 0.5, found.depth[0], torch.inf)
+        return Picture(_bytes(found.color[0]), depth.numpy())
 
     def _scene(self, kind: PictureKind, state: EditState, *, draft: bool) -> Gaussians:
         if kind == "Result":
@@ -113,16 +158,34 @@ class Pictures:
         return cv2.resize(_bytes(image), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
 
-def wipe_comparison(
-    left: UInt8[np.ndarray, "h w 3"], right: UInt8[np.ndarray, "h w 3"], split: float
-) -> UInt8[np.ndarray, "h w 3"]:
-    """`left` up to fraction `split` of the width, `right` beyond it, and a white line between them."""
-    width = left.shape[1]
-    at = round(split * width)
-    out = np.concatenate([left[:, :at], right[:, at:]], axis=1)
-    if 0 < at < width:
-        out[:, max(0, at - 1) : at + 1] = 255
+def with_object(background: Picture, object_: Gaussians, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture with an object in front of what is farther away in it."""
+    found = render(object_, camera, outputs=frozenset({"color", "depth"}))
+    alpha = found.alpha[0].numpy()
+    if background.depth is not None:
+        # half an opaque pixel's depth is that of the object itself
+        alpha = np.where(found.depth[0].numpy() < background.depth, alpha, 0)
+    color = found.color[0].clamp(0, 1).numpy()
+    share = np.where(alpha > 0, 1 - alpha, 1)[..., None]
+    out = background.pixels * share + 255 * np.where(alpha[..., None] > 0, color, 0)
+    return out.clip(0, 255).astype(np.uint8)
+
+
+def _tinted(pixels: UInt8[np.ndarray, "h w 3"], share: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """The picture with a colour over what is selected, and a line around it."""
+    inside = share.clamp(0, 1).numpy()[..., None]
+    out = pixels * (1 - 0.4 * inside) + 0.4 * inside * 255 * np.array(TINT)
+    out = np.ascontiguousarray(out.clip(0, 255).astype(np.uint8))
+    edges = cv2.findContours((inside[..., 0] > 0.5).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    r, g, b = (255 * value for value in TINT)
+    cv2.drawContours(out, edges, -1, (r, g, b), max(2, pixels.shape[1] // 500), cv2.LINE_AA)
     return out
+
+
+def jpeg(pixels: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
+    """A picture as JPEG, of a quality from 0 to 100."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    return cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), options)[1].tobytes()
 
 
 def with_badge(pixels: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h w 3"]:

@@ -24,7 +24,7 @@ _COORDINATES = (-1e6, 1e6)
 _HEIGHTS_CM = (1e-3, 1e7)
 """Heights that can be typed: from a hundredth of a millimetre to a hundred kilometres."""
 _WEIGHTS, _STOPS = (0.0, 100.0), (-16.0, 16.0)
-"""Weights of a layer of the light transfer, and exposures of the objects in stops."""
+"""Weights of a layer of the light transfer, and exposure and warmth of the objects in stops."""
 _ORTHONORMAL = 1e-3
 """Largest deviation of a rotation from orthonormality: typed angles and float32 stay below 1e-6."""
 
@@ -74,7 +74,7 @@ def check_state(state: EditState) -> None:
     _check_choice(state.keep, get_args(Keep), "keep")
     _check_choice(state.harmonizer, tuple(HARMONIZERS), "image model")
     for name, value in asdict(state.weights).items():
-        _check_number(value, name, _STOPS if name == "exposure" else _WEIGHTS)
+        _check_number(value, name, _STOPS if name in ("exposure", "warmth") else _WEIGHTS)
     if state.light is not None:
         light_from_json(light_to_json(state.light))
 

@@ -58,6 +58,8 @@ class LayerWeights:
     """The change of colour within the object's shade; its brightness stays."""
     exposure: float = 0.0
     """Stops by which the object is brighter than computed, its reflections excepted; 0 is physically right."""
+    warmth: float = 0.0
+    """Stops by which red gains on blue on the object, at the same brightness; 0 is physically right."""
 
 
 @dataclass(frozen=True)
@@ -142,12 +144,15 @@ class Relit:
         return replace(changed, opacity_logits=logits)
 
     def ratio(self, weights: LayerWeights = LayerWeights()) -> Float[Tensor, "m 3"]:
-        """Factor on linear rgb that shade, tint, exposure, shadow and bounce make together."""
+        """Factor on linear rgb that shade, tint, exposure, warmth, shadow and bounce make together."""
         shade = self.shade**weights.shade
         if weights.tint != 1:
             shade = _tinted(shade, weights.tint)
         if weights.exposure:
             shade = torch.where(self.is_object[:, None], 2**weights.exposure * shade, shade)
+        if weights.warmth:
+            warm = 2 ** (weights.warmth * shade.new_tensor([0.5, 0.0, -0.5]))
+            shade = torch.where(self.is_object[:, None], warm / (warm @ LUMINANCE.to(warm)) * shade, shade)
         return shade * (self.shadow**weights.shadow + weights.bounce * self.bounce)
 
 

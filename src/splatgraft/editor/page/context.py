@@ -20,7 +20,7 @@ from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session, Stamps, stamps_of
 from splatgraft.runtime.files import atomic_write
 
-STATUS_ORDER, HISTORY_ORDER, VIEW_ORDER = 1e6, 2e6, 3e6
+VIEW_ORDER, STATUS_ORDER, HISTORY_ORDER, MORE_ORDER = 0.5e6, 1e6, 2e6, 3e6
 """Places in the panel of what stands below the phases."""
 _UPLOADS_FOLDER = "uploads"
 Control = TypeVar("Control")
@@ -62,7 +62,12 @@ class PageContext:
         self.on_moved: list[Callable[[], None]] = []
         """Called when the view or the shape of the editing window has changed."""
         self.status = self.gui.add_html("", order=STATUS_ORDER)
+        self.more = self.gui.add_folder("More", order=MORE_ORDER, expand_by_default=False)
+        """Holds what a phase does not show at first."""
+        self.more_folders: dict[str, viser.GuiFolderHandle] = {}
+        """The folders in `more`, by the name of a phase, or of what all phases share."""
         self._seen: Stamps = ()
+        self._is_bad = False
         self.open_session()
 
     def open_session(self) -> None:
@@ -90,6 +95,12 @@ class PageContext:
             raise ValueError("project: expected one, found none; name two captures and start")
         return self.session
 
+    def more_of(self, name: str) -> viser.GuiFolderHandle:
+        """A new folder in `more`; `with` it, controls are added to it."""
+        with self.more:
+            self.more_folders[name] = self.gui.add_folder(name)
+        return self.more_folders[name]
+
     # events
 
     def on(self, control: Control, work: Callable[[], object]) -> Control:
@@ -107,6 +118,8 @@ class PageContext:
             if getattr(event, "client_id", 0) is None:
                 return  # the program itself has set a control
             with self.lock:
+                if self._is_bad:
+                    self.say("")  # an error holds until the next action
                 with self.reported():
                     work(event)
                 self.refresh()
@@ -126,6 +139,7 @@ class PageContext:
 
     def say(self, sentence: str, *, bad: bool = False) -> None:
         """Show one sentence in the status line."""
+        self._is_bad = bad
         self.status.content = note(html.escape(" ".join(sentence.split())), kind="status", bad=bad)
 
     def say_error(self, error: Exception) -> None:

@@ -54,8 +54,13 @@ class JobPanel:
         names = [step.name for step in state.plan]
         if state.step in names:
             rest += f" &middot; step {names.index(state.step) + 1} of {len(names)}"
-        step, message = html.escape(state.step or "starting"), html.escape(state.message or "...")
-        self._text.content = note(f"<b>{html.escape(state.title)}</b><br>{step}: {message}<br>{rest}", kind="job")
+        message = html.escape(state.message or "...")
+        at, rows = names.index(state.step) if state.step in names else -1, []
+        for index, name in enumerate(names):
+            mark = "&#10003;" if index < at else "&#9679;" if index == at else "&middot;"
+            rows.append(f"{mark} {html.escape(name)}{f': {message}' if index == at else ''}")
+        steps = "<br>".join(rows) if at >= 0 else f"{html.escape(state.step or 'starting')}: {message}"
+        self._text.content = note(f"<b>{html.escape(state.title)}</b><br>{rest}<br>{steps}", kind="job")
         self._bar.value = 100 * state.fraction
 
     def _say_end(self, state: JobState) -> None:

@@ -4,8 +4,9 @@ light transfer.
 
 import html
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,30 +14,43 @@ import viser
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.directions import tangents
 from splatgraft.editor.page.context import PageContext, Phase, note
 from splatgraft.editor.page.handles import add_handle
 from splatgraft.editor.page.preview_panel import PreviewPanel
-from splatgraft.editor.page.scene_view import ray_from_viser
+from splatgraft.editor.page.scene_view import camera_from_viser, ray_from_viser
 from splatgraft.editor.picking import first_surface_hit
 from splatgraft.editor.session import Session
+from splatgraft.editor.sky_dome import SkyDome
 from splatgraft.relighting import LayerWeights, Light, LightSource
-from splatgraft.relighting.light.sun import SET_BY_HAND, Point, set_sun, with_sun
+from splatgraft.relighting.light.sun import Point, set_sun, with_sun
 
+_FIRST = (
+    ("exposure", "Brightness", (-2.0, 2.0), "Of the object, in stops; 0 is as computed"),
+    ("warmth", "Warmth", (-2.0, 2.0), "Of the object's colours; 0 is as computed"),
+    ("shadow", "Shadow strength", (0.0, 2.0), "1 is as computed"),
+)
 _LAYERS = (
     ("shade", "Shade", (0.0, 2.0), "Light and dark sides of the object; 1 is as computed"),
     ("tint", "Tint", (0.0, 4.0), "Change of the object's colour by the new light; 1 is as computed"),
-    ("exposure", "Exposure", (-2.0, 2.0), "Stops by which the object is brighter; 0 is as computed"),
-    ("shadow", "Shadow", (0.0, 2.0), "Light that the object takes from its surroundings; 1 is as computed"),
     ("bounce", "Bounce", (0.0, 2.0), "Light that the object reflects onto its surroundings; 1 is as computed"),
     ("gloss", "Gloss", (0.0, 2.0), "Reflections on the object; 1 is as computed"),
 )
 """Field of `LayerWeights`, label, range of the slider and hint."""
+_SOFTNESS = (0.3, 30.0)
+"""Degrees; the sun's own is .27."""
+_SEEN_AFTER = 0.05
+"""Change of a direction from which on the picture of the sky is turned."""
 Float3 = tuple[float, float, float]
 _NO_NAMES: tuple[str, ...] = ("1",)
 _MAX_SOURCES = 4
+_UNSEEN = 0.5
+"""Share of the directions overhead that were not photographed, from which on the panel says so."""
 _HANDLE_PX = 70.0
 """Length of the handle's arrows on the screen, pixels."""
+_NO_PIXELS = 100
+"""Width of a camera of which only the pose counts."""
 _RING_SEGMENTS = 48
 _MARK = (255, 200, 60)
 """Color of the points that set the sun."""
@@ -48,26 +62,40 @@ class LightPhase(Phase):
     def __init__(self, context: PageContext, preview: PreviewPanel) -> None:
         """Build the controls."""
         self._context, self._preview, gui = context, preview, context.gui
-        self._text = gui.add_html("")
-        self._estimate_button = gui.add_button("Estimate the light", icon=viser.Icon.SUN)
         self._sun_clicks = SunClicks(context, self._light)
-        self._source_choice = context.on(gui.add_dropdown("Source", _NO_NAMES, visible=False), self._remove_handle)
-        self._strength = context.on(gui.add_slider("Strength", 0.0, 3.0, 0.05, 1.0, visible=False), self._scale_source)
+        self._sky = gui.add_html("", visible=False)
+        self._text = gui.add_html("")
         usual = LayerWeights()
-        self._sliders = {
-            key: gui.add_slider(label, *ends, 0.05, float(getattr(usual, key)), hint=hint)
-            for key, label, ends, hint in _LAYERS
-        }
+
+        def sliders(layers: tuple[tuple[str, str, tuple[float, float], str], ...]) -> dict[str, Any]:
+            return {
+                key: gui.add_slider(label, *ends, 0.05, float(getattr(usual, key)), hint=hint)
+                for key, label, ends, hint in layers
+            }
+
+        self._sliders = sliders(_FIRST)
+        self._softness = gui.add_slider(
+            "Shadow softness", *_SOFTNESS, 0.1, 1.0, hint="Degrees that the chosen light seems wide", visible=False
+        )
         self._reset = context.on(gui.add_button("Back to the estimate", color="gray"), self._reset_to_estimate)
+        with context.more_of("Light"):
+            self._source_choice = context.on(gui.add_dropdown("Source", _NO_NAMES, visible=False), self._remove_handle)
+            self._strength = context.on(
+                gui.add_slider("Strength", 0.0, 3.0, 0.05, 1.0, visible=False), self._scale_source
+            )
+            self._sliders |= sliders(_LAYERS)
         self._handle: viser.TransformControlsHandle | None = None
         self._dragged_light: Light | None = None
+        self._dome: SkyDome | None = None
+        """How the picture of the sky is turned."""
         self._full: tuple[Float3, ...] = ()
         """Irradiance of each source at a strength of 1: what it was before the slider changed it."""
         self._scaled: tuple[LightSource, ...] | None = None
         """The sources that the slider made last."""
-        context.on(self._estimate_button, self._show_estimate)
+        context.on(self._softness, self._soften)
         for slider in self._sliders.values():
             context.on(slider, self._set_weights)
+        context.guarded.hands["light"] = self._drag_on_sky
 
     def leave(self) -> None:
         """Hide the light sources."""
@@ -86,10 +114,11 @@ class LightPhase(Phase):
         objects = session.objects()
         # the arrows stand at the object
         light = self._light(session) if objects and session.scenes.at_hand(session.scenes.base_files(objects)) else None
-        self._estimate_button.visible = session.files.transfers_light and light is None and bool(objects)
         self._reset.disabled = session.state.light is None
         self._sun_clicks.refresh(light)
-        self._source_choice.visible = self._strength.visible = light is not None and bool(light.sources)
+        for control in (self._source_choice, self._strength, self._softness):
+            control.visible = light is not None and bool(light.sources)
+        self._sky.visible = light is not None
         if light is None:
             self._text.content = note(html.escape(_missing_reason(session)), kind="light")
             return
@@ -102,10 +131,35 @@ class LightPhase(Phase):
             index = min(self._index(), len(light.sources) - 1)
             now, full = max(light.sources[index].irradiance), max(self._full[index])
             self._strength.value = round(now / full, 2) if full > 0 else 1.0
-        described = light.describe(session.up())
-        by = "Estimated: " if session.state.light is None else "" if SET_BY_HAND in described else "Set by hand: "
-        self._text.content = note(html.escape(by + described), kind="light")
+            self._softness.value = round(
+                min(_SOFTNESS[1], max(_SOFTNESS[0], light.sources[index].angular_radius_deg)), 1
+            )
+        self._show_sky(session, light)
         self._draw(session, light)
+
+    def view_shown(self, camera: Cameras) -> None:
+        """Turn the picture of the sky with the view, once it rests."""
+        session = self._context.session
+        if session is None or not session.objects():
+            return
+        dome, light = SkyDome.seen_along(camera.world_from_camera[0, :3, 2], session.up()), self._light(session)
+        is_turned = self._dome is None or float((dome.forward - self._dome.forward).norm()) > _SEEN_AFTER
+        if light is not None and is_turned:
+            self._dome = dome
+            self._show_sky(session, light)
+
+    def _show_sky(self, session: Session, light: Light) -> None:
+        """The picture of the sky with its lights, and the same in words."""
+        if self._dome is None:
+            window = self._context.guarded.editing()
+            away = torch.tensor([0.0, 1.0, 0.0]) if window is None else _forward(window)
+            self._dome = SkyDome.seen_along(away, session.up())
+        self._sky.content = self._dome.svg(light)
+        named = [f"{s.name.partition(' set by hand')[0]} {self._dome.words(s)}" for s in light.sources[:_MAX_SOURCES]]
+        by = "Estimated" if session.state.light is None else "Set by hand"
+        found = "; ".join(named) if named else "even light without a clear source"
+        doubt = " What is overhead was not photographed." if light.unseen_up > _UNSEEN else ""
+        self._text.content = note(html.escape(f"{by}: {found}.{doubt}"), kind="light")
 
     def _light(self, session: Session) -> Light | None:
         """The light set by hand, else the last estimate of the preview."""
@@ -114,11 +168,6 @@ class LightPhase(Phase):
         state = session.placed_state()
         is_known = session.files.transfers_light and session.relighting.is_relit(state)
         return session.relighting.relit(state).light if is_known else None
-
-    def _show_estimate(self) -> None:
-        session = self._context.require_session()
-        for found in session.relighting.relit(session.placed_state()).report[:1]:
-            self._context.say(found.text)
 
     def _set_weights(self) -> None:
         session = self._context.require_session()
@@ -142,6 +191,37 @@ class LightPhase(Phase):
         edited = _with_source(light, index, replace(light.sources[index], irradiance=(r, g, b)))
         self._scaled = edited.sources
         session.change(replace(session.placed_state(), light=edited))
+
+    def _soften(self) -> None:
+        session = self._context.require_session()
+        light = self._light(session) if session.objects() else None
+        if light is not None and light.sources:
+            index = min(self._index(), len(light.sources) - 1)
+            wide = replace(light.sources[index], angular_radius_deg=float(self._softness.value), uncertainty_deg=0.0)
+            session.change(replace(session.placed_state(), light=_with_source(light, index, wide)))
+
+    def _drag_on_sky(self, query: Mapping[str, str]) -> None:
+        """Move a light on the picture of the sky, to x and y over the horizon's radius."""
+        session, dome = self._context.require_session(), self._dome
+        light = self._dragged_light or (self._light(session) if session.objects() else None)
+        x, y, index = float(query["x"]), float(query["y"]), int(query["source"])
+        if self._context.phase != "Light" or dome is None or light is None or not 0 <= index < len(light.sources):
+            raise ValueError("light: expected a light of the picture of the sky, found none")
+        if not math.hypot(x, y) < 2:
+            raise ValueError(f"light: expected a place in the picture of the sky, found {x:g}, {y:g}")
+        if index < len(self._source_choice.options):
+            self._source_choice.value = self._source_choice.options[index]
+        self._move_light(session, with_direction(light, index, dome.direction(x, y)), ended=query.get("end") == "1")
+
+    def _move_light(self, session: Session, light: Light, *, ended: bool) -> None:
+        """Show a light whose source is being dragged, and save it at the end, as one undo step."""
+        self._dragged_light = light
+        edited = replace(session.placed_state(), light=light)
+        self._draw(session, light)
+        if ended:
+            self._dragged_light = None
+            self._context.callback(lambda _: session.change(edited))(None)
+        self._preview.set_dragged_state(None if ended else edited)
 
     # arrows
 
@@ -197,14 +277,8 @@ class LightPhase(Phase):
         if light is None:
             return
         position = torch.tensor(np.asarray(handle.position), dtype=torch.float32)
-        dragged = with_direction(light, self._index(), position - self._centre_and_length(session)[0])
-        self._dragged_light, ended = dragged, event.phase == "end"
-        edited = replace(session.placed_state(), light=dragged)
-        self._draw(session, dragged)
-        if ended:
-            self._dragged_light = None
-            self._context.callback(lambda _: session.change(edited))(None)
-        self._preview.set_dragged_state(None if ended else edited)
+        towards = position - self._centre_and_length(session)[0]
+        self._move_light(session, with_direction(light, self._index(), towards), ended=event.phase == "end")
 
 
 class SunClicks:
@@ -290,6 +364,11 @@ class SunClicks:
             "as the shadow's edge shows" if sun.ratio is not None else "estimated, as no edge of the shadow is seen"
         )
         self._context.say(f"the sun by {agree}; its strength is {strength}; another pair makes it more exact")
+
+
+def _forward(window: viser.ClientHandle) -> Float[Tensor, "3"]:
+    """Where a window looks."""
+    return camera_from_viser(window.camera, width=_NO_PIXELS).world_from_camera[0, :3, 2]
 
 
 def arrow_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "2 3"]:

@@ -50,14 +50,18 @@ class OpenPhase(Phase):
         self._is_usable = [False, False]
         self._looker = LatestOnlyWorker(self._look, context.say_error)
         context.on_close.append(self._looker.close)
-        self._trained = gui.add_folder("Scenes trained on these captures", expand_by_default=False)
-        with self._trained:
-            self._scenes = tuple(gui.add_text(of, "", hint=_TRAINED_HINT) for of in ("Of the object", "Of the place"))
-        self._upload = context.add_upload("Upload a video or a scene", (*SCENE_SUFFIXES, *_VIDEOS), self._uploaded)
+        # viser shows an upload button always: its folder can be hidden
+        self._upload = gui.add_folder("From this device")
+        with self._upload:
+            context.add_upload("Upload a video or a scene", (*SCENE_SUFFIXES, *_VIDEOS), self._uploaded)
         self._start = context.on(gui.add_button("Start the project", icon=viser.Icon.PLUS), self._create)
         self._facts = gui.add_html("")
-        self._looks = {side: gui.add_dropdown(f"Cameras: {side}", tuple(_LOOKS), visible=False) for side, _ in _SIDES}
-        self._ups = {side: gui.add_dropdown(f"Up: {side}", tuple(_UPS), visible=False) for side, _ in _SIDES}
+        with context.more_of("Open"):
+            self._scenes = tuple(
+                gui.add_text(f"Scene {of}", "", hint=_TRAINED_HINT) for of in ("of the object", "of the place")
+            )
+            self._looks = {s: gui.add_dropdown(f"Cameras: {s}", tuple(_LOOKS), visible=False) for s, _ in _SIDES}
+            self._ups = {s: gui.add_dropdown(f"Up: {s}", tuple(_UPS), visible=False) for s, _ in _SIDES}
         self._other_ups: dict[Side, dict[str, Triple | None]] = {side: {} for side, _ in _SIDES}
         self._build = gui.add_button("Reconstruct both scenes", icon=viser.Icon.PLAYER_PLAY)
         for field in (self._source, self._target):
@@ -79,7 +83,7 @@ class OpenPhase(Phase):
                 bad=True,
             )
         is_new = session is None and problem is None
-        fields = (self._source, self._found_source, self._target, self._found_target, self._trained)
+        fields = (self._source, self._found_source, self._target, self._found_target, *self._scenes)
         for control in (self._help, *fields, self._upload, self._start):
             control.visible = is_new
         self._start.disabled = not all(self._is_usable)
@@ -93,12 +97,14 @@ class OpenPhase(Phase):
             return
         self._context.show_target()
         lines = [self._line(session, index) for index in range(len(_SIDES))]
-        for name, shown in self._context.view.shown.items():
-            if shown.count < shown.total:
-                lines.append(f"{name}: {shown.count:,} of {shown.total:,} shown; the files contain all")
-        self._facts.content = note("<br>".join(lines))
         have_both = session.files.source_scene.is_file() and session.files.target_scene.is_file()
-        self._build.label = "Bring both scenes up to date" if have_both else _title(session)
+        stale = (session.why_stale(f"{side}/reconstruct") for side, _ in _SIDES) if have_both else ()
+        why = next((found for found in stale if found is not None), None)
+        if why is not None:
+            lines.append(f"Out of date: {html.escape(why)}")
+        self._facts.content = note("<br>".join(lines))
+        self._build.visible = not have_both or why is not None
+        self._build.label = "Update both scenes" if have_both else _title(session)
         self._build.color = "gray" if have_both else None
 
     # a new project
@@ -125,7 +131,7 @@ class OpenPhase(Phase):
             # importing two scenes takes no training, so it starts at once
             self._context.run("reconstruct", _title(session))
             return
-        self._context.say("the project was created; reconstruct both scenes next")
+        self._context.say("the project is made; reconstruct both scenes next")
 
     def _uploaded(self, path: Path) -> None:
         fields = (self._source, self._target, *(self._scenes if path.suffix.lower() in SCENE_SUFFIXES else ()))
@@ -143,12 +149,11 @@ class OpenPhase(Phase):
         sample = session.scenes.sample(scene)
         if sample is None and not session.scenes.at_hand([scene]):
             return f"<b>{name}</b>: being read"
-        count = sample.total if sample is not None else session.scenes.gaussians(scene).count
-        text = f"<b>{name}</b>: {count:,} Gaussians"
+        text = f"<b>{name}</b>: ready"
         if files.without_photos[index] and cameras.is_file():
             made = session.scenes.cameras(cameras)
             up = ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in estimate_up(made).tolist())
-            text += f"; without photographs: {len(made)} images were rendered of it, with ({up}) as up"
+            text += f", without photographs: {len(made)} pictures were rendered of it, with ({up}) as up"
         return text
 
     def _show_views(self, side: Side, views: RenderedViews) -> None:

@@ -9,7 +9,9 @@ from typing import Any
 import viser
 
 from splatgraft.core.bounds import bounding_sphere
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import concatenate
+from splatgraft.editor.jobs import JobState
 from splatgraft.editor.page.context import HISTORY_ORDER, PageContext, Phase, note
 from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.light_phase import LightPhase
@@ -20,22 +22,20 @@ from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.page.run_phase import RunPhase
 from splatgraft.editor.page.select_phase import SelectPhase
 from splatgraft.editor.page.server import GuardedServer
+from splatgraft.editor.page.share_phase import SharePhase
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
-from splatgraft.editor.sharing import served_file
+from splatgraft.editor.sharing import served_file, written_exports
 
 _POLL_SECONDS = 0.4
-_CURRENT_MARK = "\u25cf "
+PHASES = ("Open", "Select", "Place", "Light", "Run", "Share")
+_CURRENT, _DONE, _STALE, _NEXT = "\u25cf ", "\u2713 ", "\u21bb ", "\u203a "
+"""What stands before the name of a phase: the shown one, and others that are done, out of date, or to be done next."""
 _CSS = """<style>
 div:has(> * > label[for="{steps}"]) {{ display: none; }}
-@media (max-width: 36em) {{
-  div[style*="position: fixed"][style*="width: 20em"],
-  div[style*="position: fixed"][style*="width: 20em"] div[style*="width: 20em"] {{ width: 100% !important; }}
-  div[style*="position: fixed"][style*="width: 20em"] {{ max-height: 48% !important; }}
-}}
+div:has(> * > * > label[for="{steps}"]) button {{ padding: 0 5px; }}
 </style>"""
-"""The label of the steps is hidden, so that five buttons fit in one row. In a window as narrow as a phone's the panel
-takes the whole width, so that numbers are legible, and less than half of the height, so that the scene is seen."""
+"""The label of the steps is hidden, so that six buttons fit in one row."""
 _WATCH_NOTE = (
     "<b>Read-only:</b> another window edits this project; close it to edit here. The controls below have no effect."
 )
@@ -57,17 +57,18 @@ class Page:
         self._header = gui.add_html("")
         self._notices: dict[int, viser.GuiHtmlHandle] = {}
         self._views: dict[str, tuple[Any, ...]] = {}
-        self._phase_buttons = gui.add_button_group("Step", ("Open", "Select", "Place", "Light", "Run"))
+        self._phase_buttons = gui.add_button_group("Step", PHASES)
         gui.add_html(_CSS.format(steps=self._phase_buttons._impl.uuid))
         job = self._job = JobPanel(context)
         preview = self.preview = PreviewPanel(context)
         preview.light_ready = self._light_ready
         makers: dict[str, Callable[[], Phase]] = {
             "Open": lambda: OpenPhase(context),
-            "Select": lambda: SelectPhase(context),
+            "Select": lambda: SelectPhase(context, preview),
             "Place": lambda: PlacePhase(context, preview),
             "Light": lambda: LightPhase(context, preview),
-            "Run": lambda: RunPhase(context, preview, job),
+            "Run": lambda: RunPhase(context, preview),
+            "Share": lambda: SharePhase(context, preview, job),
         }
         self._folders = {name: gui.add_folder(name, visible=False) for name in makers}
         self.phases: dict[str, Phase] = {}
@@ -80,10 +81,16 @@ class Page:
         self._history = gui.add_button_group("History", ("Undo", "Redo"), order=HISTORY_ORDER)
         undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
         redo = gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift")
-        context.on(self._phase_buttons, lambda: self.show_phase(self._phase_buttons.value.removeprefix(_CURRENT_MARK)))
+        job.on_end = self._job_ended
+        preview.on_shown = self._shown
+        context.on(self._phase_buttons, lambda: self.show_phase(self._phase_buttons.value.rpartition(" ")[2]))
         context.on(self._history, lambda: self._undo() if self._history.value == "Undo" else self._redo())
         context.on(gui.add_command("Look at the object", hotkey="F"), self._frame_object)
         context.on(gui.add_command("Back to the first view", hotkey="home"), self._first_view)
+        for key, right, away in (("left", -1, 0), ("right", 1, 0), ("up", 0, 1), ("down", 0, -1)):
+            arrow: Any = f"arrow{key}"
+            command = gui.add_command(f"Move {key}", hotkey=arrow)
+            context.on(command, lambda right=right, away=away: self._arrow(right, away))
         context.on(undo, self._undo)
         context.on(redo, self._redo)
         if opening is not None:
@@ -106,9 +113,10 @@ class Page:
                 self.preview.update()
             session = context.session
             where = "no project yet" if session is None else session.files.file.parent.name
-            saved = "" if session is None else '<span style="opacity:.6;float:right">all changes are saved</span>'
+            saved = "" if session is None else '<span class="sg-saved" style="opacity:.6;float:right">saved</span>'
             self._header.content = note(f'<b style="font-size:1.1em">{html.escape(where)}</b>{saved}', kind="header")
             self._history.visible = session is not None and bool(session.history.past or session.history.future)
+            self._mark_phases()
 
     def show_phase(self, phase: str) -> None:
         """Switch to another phase."""
@@ -120,9 +128,10 @@ class Page:
             self._folders[context.phase].visible = False
             context.phase = phase
             self._folders[phase].visible = True
-            self._phase_buttons.options = tuple(
-                f"{_CURRENT_MARK}{name}" if name == phase else name for name in self.phases
-            )
+            for name, folder in context.more_folders.items():
+                # those of no phase belong to all
+                folder.visible = name == phase or name not in self._folders
+            self._mark_phases()
             if context.scene_side != scene:
                 context.view.hide_splats(f"/{scene}")
                 self.preview.scene_changed()
@@ -157,6 +166,44 @@ class Page:
         with self.context.lock:
             if self.context.phase == "Light":
                 self.phases["Light"].refresh()
+
+    def _mark_phases(self) -> None:
+        """Mark the shown phase, and which of the others are done, out of date, or next."""
+        session, current = self.context.session, self.context.phase
+        states = {name: _STALE for name in PHASES} if session is None else _states(session)
+        following = next((name for name in PHASES if states.get(name) is None and name != "Light"), None)
+        if session is None:
+            states, following = {}, None
+
+        def mark(name: str) -> str:
+            return _CURRENT if name == current else states.get(name) or (_NEXT if name == following else "")
+
+        options = tuple(f"{mark(name)}{name}" for name in PHASES)
+        if tuple(self._phase_buttons.options) != options:
+            self._phase_buttons.options = options
+
+    def _arrow(self, right: int, away: int) -> None:
+        """Move the object in the phase Place; step through the photos elsewhere."""
+        place = self.phases["Place"]
+        if self.context.phase == "Place" and isinstance(place, PlacePhase):
+            place.nudge(right, away)
+        elif right:
+            self.preview.step_camera(right)
+
+    def _shown(self, camera: Cameras) -> None:
+        """Update what depends on the view, after the preview has put a picture of it on the canvas."""
+        phase = self.phases[self.context.phase]
+        if isinstance(phase, SelectPhase):
+            phase.view_shown()
+        elif isinstance(phase, LightPhase):
+            phase.view_shown(camera)
+
+    def _job_ended(self, job: JobState) -> None:
+        run, share = self.phases["Run"], self.phases["Share"]
+        if isinstance(run, RunPhase) and job.command[:1] == ("run",) and job.outcome == "done":
+            run.result_made()
+        if isinstance(share, SharePhase):
+            share.job_ended(job)
 
     # undo
 
@@ -257,3 +304,23 @@ class Page:
                 self.refresh()
         with context.reported():
             self._job.refresh()
+
+
+def _states(session: Session) -> dict[str, str | None]:
+    """For each phase whether it is done or out of date; None where neither."""
+    files, reasons = session.files, session.project.reasons()
+
+    def state(exists: bool, *steps: str) -> str | None:
+        return None if not exists else _DONE if all(reasons.get(step) is None for step in steps) else _STALE
+
+    have_both = files.source_scene.is_file() and files.target_scene.is_file()
+    exports = written_exports(files)
+    result = max((p.stat().st_mtime_ns for p in (files.result, files.relit) if p.is_file()), default=0)
+    return {
+        "Open": state(have_both, "source/reconstruct", "target/reconstruct"),
+        "Select": state(files.object.is_file(), "segment"),
+        "Place": _DONE if session.objects() else None,
+        "Light": _DONE if session.state.light is not None or files.relit.is_file() else None,
+        "Run": state(files.result.is_file(), "consolidate"),
+        "Share": None if not exports else _DONE if exports[0].stat().st_mtime_ns >= result else _STALE,
+    }

@@ -9,10 +9,14 @@ from typing import Any
 import torch
 import viser
 
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.similarity import Similarity
+from splatgraft.editor.grab import GrabMode, Point2
 from splatgraft.editor.page.context import PageContext, Phase, note, parse_path
 from splatgraft.editor.page.handles import SNAP_DEGREES, BoxHandles, ObjectGizmo
+from splatgraft.editor.page.hands import ObjectHands
 from splatgraft.editor.page.preview_panel import PreviewPanel
+from splatgraft.editor.page.scene_view import camera_from_viser
 from splatgraft.editor.placement import (
     Gizmo,
     ObjectSize,
@@ -25,9 +29,11 @@ from splatgraft.editor.placement import (
     quaternion_from_degrees,
     rescale,
     similarity_from_gizmo,
+    snapped_angles,
     suggest_placement,
 )
 from splatgraft.editor.session import Session
+from splatgraft.editor.sky_dome import SkyDome
 from splatgraft.editor.state import check_numbers, check_state
 from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
 from splatgraft.formats.placement import ObjectPlacement
@@ -37,7 +43,11 @@ _NO_NAMES: tuple[str, ...] = ("1",)
 """Options of a dropdown while there is nothing to choose."""
 _SNAP_NEAR = 0.5
 """Distance from the surface, over the object's height, within which a drag ends on it."""
-_SCALES = ("its capture", "the place")
+_NUDGE = 0.05
+"""Step of an arrow key over the object's height."""
+_NO_PIXELS = 100
+"""Width of a camera of which only the pose counts."""
+_SCALES = ("its photos", "the place")
 _SAME = 0.002
 """Relative difference below which two sizes count as one."""
 
@@ -54,27 +64,34 @@ class PlacePhase(Phase):
         self._note = gui.add_html("", visible=False)
         self._suggest = context.on(gui.add_button("Find a place", icon=viser.Icon.WAND), self._find_place)
         self._object_choice = context.on(gui.add_dropdown("Object", _NO_NAMES), self._choose)
-        self._position = gui.add_vector3("Position", (0.0, 0.0, 0.0), step=0.001)
-        self._degrees = gui.add_vector3("Rotation", (0.0, 0.0, 0.0), step=0.01, hint="Degrees about x, y, z")
-        self._scale = gui.add_number("Scale", 1.0, min=1e-4, step=0.001)
+        self._scale = gui.add_number("Scale", 1.0, min=1e-4, step=0.001, hint="Over its size in its own capture")
         self._size = SizeControls(context)
         self._operations = gui.add_button_group("Move", ("Drop", "Upright", "Fit size"))
-        self._snap = gui.add_checkbox(
-            "Snap",
-            False,
-            hint=f"A drag turns in steps of {SNAP_DEGREES:.0f} degrees and ends on a near surface (Shift+S)",
-        )
         self._object_buttons = context.on(gui.add_button_group("Object ", ("Duplicate", "Delete")), self._object_button)
-        with gui.add_folder("Another object", expand_by_default=False):
-            self._path = gui.add_text("File", "", hint="A trained scene (.ply, .spz, .sog, ...) of the object alone")
+        with context.more_of("Place"):
+            self._position = gui.add_vector3("Position", (0.0, 0.0, 0.0), step=0.001)
+            self._degrees = gui.add_vector3("Rotation", (0.0, 0.0, 0.0), step=0.01, hint="Degrees about x, y, z")
+            self._snap = gui.add_checkbox("Snap", False, hint=f"Turns in steps of {SNAP_DEGREES:.0f} degrees (Shift+S)")
+            self._has_gizmo = context.on(
+                gui.add_checkbox("Arrows and rings", False, hint="Handles for each axis, in place of dragging"),
+                lambda: None,
+            )
+            self._size.build_more()
+            self._path = gui.add_text(
+                "File", "", hint="A trained scene (.ply, .spz, .sog, ...) of another object alone"
+            )
             self._add = gui.add_button("Add this file", icon=viser.Icon.PLUS, color="gray")
             context.add_upload("Upload a file", SCENE_SUFFIXES, self._add_file)
-        with gui.add_folder("Erase from the target", expand_by_default=False):
-            self._show_box = context.on(gui.add_checkbox("Show the box", False), self._toggle_box)
+            self._show_box = context.on(
+                gui.add_checkbox("Box to erase in", False, hint="What is in it is taken out of the place"),
+                self._toggle_box,
+            )
             self._erase = gui.add_button("Erase inside the box", icon=viser.Icon.ERASER, color="gray")
             self._restore = context.on(gui.add_button("Restore all erased", color="gray"), self._restore_all)
         self._handles = BoxHandles(context.server, context.view, "/target/box", color=(240, 70, 70))
         self._gizmo = ObjectGizmo(context.server, self._dragged)
+        self._hands = ObjectHands(context, on_grabbed=self._grabbed, on_dropped=self._dropped)
+        preview.outlines = self._outlines
         for control in (self._position, self._degrees, self._scale):
             context.on(control, self._numbers_changed)
         context.on(self._operations, lambda: self._apply_operation(self._operations.value))
@@ -83,13 +100,25 @@ class PlacePhase(Phase):
         self._add_key("Drop to the surface", "G", lambda: self._apply_operation("Drop"))
         self._add_key("Duplicate the object", "D", self._duplicate, modifier="cmd/ctrl")
         self._add_key("Delete the object", "delete", self._delete)
-        # held without a modifier, S and D fly the camera
         self._add_key("Snap on or off", "S", self._toggle_snap, modifier="shift")
+
+    def nudge(self, right: int, away: int) -> None:
+        """Move the chosen object by a small step: to the right in the view, and away from the viewer."""
+        session, window = self._context.require_session(), self._context.guarded.editing()
+        if window is None or not session.objects():
+            return
+        item, placed = session.placeable_object(self._chosen), session.objects()[self._chosen].target_from_object
+        camera, up = camera_from_viser(window.camera, width=_NO_PIXELS), session.up()
+        dome = SkyDome.seen_along(camera.world_from_camera[0, :3, 2], up)
+        step = _NUDGE * placed.scale * max(item.base.height, item.base.radius)
+        moved = placed.translation + step * (right * dome.right + away * dome.forward)
+        self._set_placement(replace(placed, translation=moved))
 
     def leave(self) -> None:
         """Hide the handles."""
         self._handles.hide()
         self._gizmo.remove()
+        self._hands.release()
 
     def refresh(self) -> None:
         """Update the 3D view, the list of objects, the numbers and the gizmo."""
@@ -100,7 +129,7 @@ class PlacePhase(Phase):
         objects = session.objects() if has_target else ()
         problem = None
         if not has_target:
-            problem = "The target is not reconstructed yet: see Open."
+            problem = "The place is not there yet: see Open."
         elif not objects and not session.files.object.is_file():
             problem = "There is no object yet: cut one out in Select, or add one from a file."
         self._suggest.visible = not objects and problem is None
@@ -108,9 +137,10 @@ class PlacePhase(Phase):
             problem = problem or session.scenes.reading_note(session.files.target_scene)
         self._note.visible, self._note.content = problem is not None, note(problem or "")
         is_usable = bool(objects) and session.scenes.at_hand(session.scenes.base_files(objects))
-        fields = (self._object_choice, self._position, self._degrees, self._scale)
-        for control in (*fields, self._operations, self._snap, self._object_buttons):
+        fields = (self._position, self._degrees, self._scale)
+        for control in (*fields, self._operations, self._snap, self._has_gizmo, self._object_buttons):
             control.visible = is_usable
+        self._object_choice.visible = is_usable and len(objects) > 1
         self._chosen = max(0, min(self._chosen, len(objects) - 1))
         if is_usable:
             names = tuple(f"{i + 1}: {session.scenes.object_path(item).name}" for i, item in enumerate(objects))
@@ -120,16 +150,19 @@ class PlacePhase(Phase):
             if not self._dragging:
                 self._show_numbers(self._current())
                 self._gizmo.snaps = self._snap.value
-                item = session.placeable_object(self._chosen)
-                self._gizmo.show(item, objects[self._chosen].target_from_object)
+                if self._has_gizmo.value:
+                    item = session.placeable_object(self._chosen)
+                    self._gizmo.show(item, objects[self._chosen].target_from_object)
+                else:
+                    self._gizmo.remove()
                 self._size.show(self._chosen)
         else:
             self._size.hide()
             self._gizmo.remove()
         if not self._show_box.value:
             self._handles.hide()
-        self._erase.disabled = not self._show_box.value
-        self._restore.disabled = session.state.erased is None
+        self._erase.visible = self._show_box.value
+        self._restore.visible = session.state.erased is not None
 
     def _add_key(self, label: str, key: Any, work: Callable[[], object], *, modifier: Any = None) -> None:
         command = self._context.gui.add_command(label, hotkey=key, modifier=modifier)
@@ -192,7 +225,7 @@ class PlacePhase(Phase):
         session.change(replace(session.state, objects=(ObjectPlacement(placed.target_from_object),)))
         doubts = " ".join(note.text for note in placed.warnings)
         self._context.say(
-            f"placed. {doubts}" if doubts else "placed on a level, visible surface; drag it, or type numbers"
+            f"placed. {doubts}" if doubts else "placed on a level, visible surface; drag it where you want it"
         )
 
     def _choose(self) -> None:
@@ -256,13 +289,33 @@ class PlacePhase(Phase):
             raise ValueError("box: expected one in view, found none")
         inside, before = box.contains(session.scenes.gaussians(session.files.target_scene).means), session.state.erased
         session.change(replace(session.placed_state(), erased=inside if before is None else before | inside))
-        self._context.say(f"erased: {int(inside.sum()):,} Gaussians of the target")
+        self._context.say("erased what is in the box" if bool(inside.any()) else "nothing is in the box")
 
     def _restore_all(self) -> None:
         session = self._context.require_session()
         session.change(replace(session.placed_state(), erased=None))
 
-    # the gizmo
+    # the pointer and the gizmo
+
+    def _outlines(self, camera: Cameras) -> list[list[Point2]]:
+        is_free = self._context.phase == "Place" and not self._has_gizmo.value
+        return self._hands.outlines(camera) if is_free else []
+
+    def _grabbed(self, index: int) -> None:
+        if index != self._chosen:
+            self._chosen = index
+            self._context.refresh()
+
+    def _dropped(self, index: int, placed: Similarity, mode: GrabMode) -> None:
+        session = self._context.require_session()
+        if mode == "move" or (mode == "lift" and self._snap.value):
+            placed = self._snapped_to_surface(session, placed)
+        if mode == "turn" and self._snap.value:
+            gizmo = gizmo_from_similarity(placed, session.placeable_object(index).base.point)
+            angles = snapped_angles(degrees_from_quaternion(gizmo.wxyz), SNAP_DEGREES)
+            gizmo = replace(gizmo, wxyz=quaternion_from_degrees(angles))
+            placed = similarity_from_gizmo(gizmo, session.placeable_object(index).base.point)
+        session.set_placement(index, placed)
 
     def _dragged(self, placed: Similarity, ended: bool) -> None:
         """Show a placement during a drag, and save it at its end, as one undo step."""
@@ -297,7 +350,7 @@ class PlacePhase(Phase):
 
 
 class SizeControls:
-    """A height in centimetres where the target's scale is known, and a folder that sets both scales."""
+    """A height in centimetres where the target's scale is known, and under More what sets both scales."""
 
     def __init__(self, context: PageContext) -> None:
         """Build the controls in the current folder of the panel."""
@@ -305,26 +358,31 @@ class SizeControls:
         self._index = 0
         self._shown: float | None = None
         """What the field of the height shows; as `SelectPhase._shown_box`."""
-        self._height = gui.add_number("Height, cm", 0.0, min=0.0, step=0.01, hint="Of the object, in the target")
+        self._height = gui.add_number("Height, cm", 0.0, min=0.0, step=0.01, hint="Of the object, in the place")
         self._true_size = gui.add_button("As tall as it truly is", color="gray", visible=False)
         self._note = gui.add_html("")
-        self._folder = gui.add_folder("Set the scale", expand_by_default=False)
-        with self._folder:
-            self._known = gui.add_number("True height, cm", 0.0, min=0.0, step=0.1, hint="Of the object, as measured")
-            self._set = context.on(gui.add_button_group("Scale of", _SCALES), lambda: self._set_scale(self._set.value))
         context.on(self._height, self._typed)
         context.on(self._true_size, self._to_true_size)
 
+    def build_more(self) -> None:
+        """Build the controls that set the scales in the current folder."""
+        gui = self._context.gui
+        self._known = gui.add_number("True height, cm", 0.0, min=0.0, step=0.1, hint="Of the object, as measured")
+        self._set = gui.add_button_group("sets scale of", _SCALES)
+        self._context.on(self._set, lambda: self._set_scale(self._set.value))
+
     def hide(self) -> None:
         """Hide all."""
-        self._height.visible = self._true_size.visible = self._note.visible = self._folder.visible = False
+        for control in (self._height, self._true_size, self._note, self._known, self._set):
+            control.visible = False
 
     def show(self, index: int) -> None:
         """Show the size of one placed object."""
         self._index = index
-        self._note.visible = self._folder.visible = True
+        self._note.visible = self._known.visible = self._set.visible = True
         try:
-            size = self._context.require_session().size(index)
+            session = self._context.require_session()
+            size = session.size(index)
         except ValueError as error:
             self._height.visible = self._true_size.visible = False
             self._note.content = note(html.escape(str(error)), kind="size", faint=True)
@@ -335,7 +393,9 @@ class SizeControls:
         if here is not None and here != self._shown:
             self._shown = here
             self._height.value = round(here, 2)
-        self._note.content = note(html.escape(_about(size)), kind="size", faint=True)
+        given = session.files.place_options.scale
+        is_given = given is not None and abs(size.scale / given - 1) < _SAME
+        self._note.content = note(html.escape(_about(size, is_given=is_given)), kind="size", faint=True)
 
     def _typed(self) -> None:
         self._shown = None  # so that the field goes back where this number is refused
@@ -362,18 +422,12 @@ class SizeControls:
         self._context.say(f"stored in {path}, as `splatgraft scale` does; Undo leaves it")
 
 
-def _about(size: ObjectSize) -> str:
-    """What is known of an object's size, and how to tell the rest."""
-    parts = []
-    if size.true_cm is not None and size.own is not None:
-        parts.append(f"In its own capture it is {size.true_cm:.4g} cm tall, by {size.own.source}.")
-    if size.place is not None:
-        parts.append(f"The place has its scale from {size.place.source}.")
+def _about(size: ObjectSize, *, is_given: bool) -> str:
+    """What is known of an object's size, and how to tell the rest; `is_given`: project.toml says the scale."""
+    if size.place is None and is_given:
+        return f"Its size is what the project says: {size.scale:.4g} times that in its own photos."
     if size.place is None:
-        parts.append(
-            "Its size in cm is not known, as the place has no scale: its size here is a guess. Set the scale below, "
-            "by the object's true height, or by `splatgraft scale`."
-        )
-    elif size.own is None:
-        parts.append("How tall it truly is, is not known: set the scale of its capture below.")
-    return " ".join(parts)
+        return "Its size here is a guess, as nobody has measured the place: under More, type the object's true height."
+    if size.own is None:
+        return "How tall it truly is, is not known: type it under More."
+    return f"In its own photos it is {size.true_cm:.4g} cm tall."

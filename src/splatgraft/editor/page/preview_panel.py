@@ -1,7 +1,8 @@
-"""The renderer's pictures on the canvas or in the panel: two kinds with a slider between them, and steps through the
-cameras."""
+"""The renderer's pictures on the canvas, what the page's script is told of them, and steps through the cameras."""
 
+import base64
 import html
+import json
 import time
 import traceback
 from collections.abc import Callable
@@ -11,19 +12,23 @@ from pathlib import Path
 import numpy as np
 import torch
 import viser
+from jaxtyping import UInt8
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
+from splatgraft.core.prompts import ViewPrompt
+from splatgraft.editor.grab import Point2
 from splatgraft.editor.memo import Memo
 from splatgraft.editor.page.context import VIEW_ORDER, PageContext
 from splatgraft.editor.page.scene_view import Canvas, camera_from_viser
+from splatgraft.editor.photo_view import PhotoView, standing_at
 from splatgraft.editor.pictures import (
     NEEDS_LIGHT,
     PICTURE_KINDS,
     SOURCE_KINDS,
     Picture,
     PictureKind,
-    wipe_comparison,
+    jpeg,
     with_badge,
 )
 from splatgraft.editor.session import Session
@@ -40,10 +45,12 @@ _COARSE_ABOVE = 0.4
 """Seconds; a picture that takes longer is preceded by a coarse one."""
 _COARSE_SHARE, _COARSE_BUDGET = 0.5, 120_000
 """Size of a coarse picture over the canvas's, and its number of Gaussians."""
-_PANEL_WIDTH, _MAX_WIDTH, _SAVED_WIDTH = 480, 1920, 1280
-"""Pixels of the picture in the panel, of the largest one on the canvas, which the browser enlarges, and of a file."""
-_MIN_ASPECT = 1.2
-"""Minimum width over height of the picture in the panel."""
+_NO_WINDOW_WIDTH, _MAX_WIDTH, _SAVED_WIDTH = 480, 1920, 1280
+"""Pixels of a picture that no window shows, of the largest one on the canvas, which the browser enlarges, of a file."""
+_BEFORE_QUALITY = 85
+"""JPEG quality of the picture under the divider."""
+_NAMES: dict[PictureKind, str] = {"Source": "photo", "Selection": "selected"}
+"""What the divider calls its two pictures, where that is not the name of their kind."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +62,10 @@ class PictureRequest:
     camera: Cameras
     left: PictureKind
     right: PictureKind
-    split: float
     window: viser.ClientHandle | None
-    """The window whose canvas shows the picture; None: the panel shows it."""
+    """The window whose canvas shows the picture; None: none is open."""
+    photo: int | None = None
+    """The number of the photo from whose place the scene is seen; None where it is seen from elsewhere."""
     is_dragging: bool = False
     """Whether something is being dragged; then a draft suffices."""
     is_moved: bool = False
@@ -82,19 +90,32 @@ class PictureRequest:
         stamp = result.stat().st_mtime_ns if result.is_file() else 0
         best_draft = self.session.relighting.best(state) if self.draft else None
         selection = self.session.selection() if self.is_of_source else None
-        drawn = (_pose(self.camera), self.draft, best_draft, self.budget or 0, stamp)
-        return (*drawn, state.objects, state.erased, state.light, state.weights, selection)
+        prompts = state.prompts if self.is_of_source else None
+        drawn = (
+            _pose(self.camera),
+            self.draft,
+            best_draft,
+            self.budget or 0,
+            stamp,
+            -1 if self.photo is None else self.photo,
+        )
+        return (*drawn, state.objects, state.erased, state.light, state.weights, selection, prompts)
 
     def draw(self, kind: PictureKind) -> Picture:
         """Draw one of the pictures; ValueError where a file that it needs does not exist yet."""
         session, pictures = self.session, self.session.pictures
         if self.is_of_source:
-            return pictures.source_view(session.selection() if kind == "Object alone" else None, self.camera)
+            return pictures.of_source(kind, self.state, session.selection(), self.camera, self.photo)
+        if kind == "Photograph" and self.photo is not None:
+            camera = session.scenes.cameras(session.files.target_cameras)[self.photo]
+            picture = pictures.view(kind, self.state, camera.resized(min(1.0, self.camera.width / camera.width)))
+            view = PhotoView((camera.width, camera.height), (self.camera.width, self.camera.height))
+            return Picture(view.drawn(picture.pixels, ViewPrompt()))
         return pictures.view(kind, self.state, self.camera, draft=self.draft, budget=self.budget)
 
 
 class PreviewPanel:
-    """Renders pictures in a worker thread, for the canvas or for the panel; only the newest request is rendered."""
+    """Renders pictures in a worker thread for the canvas; only the newest request is rendered."""
 
     def __init__(self, context: PageContext) -> None:
         """Build the panel."""
@@ -102,36 +123,36 @@ class PreviewPanel:
         self._drawn = Memo()
         self._dragged_state: EditState | None = None
         self._draft_seconds, self._picture_seconds = float("inf"), 0.0
-        self._light_note = ""
         self.canvas = Canvas(context.server, context.view)
         self._shown_pose: bytes = b""
         self._canvas_size: tuple[float, int] = (0.0, 0)
         self._is_on_canvas = False
         """Whether the newest request is for the canvas."""
+        self._told: tuple[int, viser.GuiHtmlHandle] | None = None
+        """The window whose script was told of its picture, and where."""
+        self._version = 0
         self.light_ready: Callable[[], None] = lambda: None
         """Called after the light has been estimated."""
+        self.on_shown: Callable[[Cameras], None] = lambda camera: None
+        """Called with the view of a picture that was put on the canvas."""
+        self.outlines: Callable[[Cameras], list[list[Point2]]] = lambda camera: []
+        """Gives the outlines of the objects that can be grabbed in a view."""
+        self.is_object_alone = False
+        """Whether the phase Select shows nothing but the object."""
         self._worker = LatestOnlyWorker(self._work, self._say_error)
         self._light_worker = LatestOnlyWorker(self._compute_light, self._say_error)
         context.on_close += [self._worker.close, self._light_worker.close]
-        self._panel = gui.add_folder("View", order=VIEW_ORDER)
-        with self._panel:
-            self._image = gui.add_image(np.full((270, 400, 3), 40, np.uint8), format="jpeg", jpeg_quality=88)
-            self._caption = gui.add_html("")
-            self._right = gui.add_dropdown("Picture", PICTURE_KINDS, initial_value="Light transfer")
-            self._left = gui.add_dropdown("Compare with", PICTURE_KINDS, initial_value="Copy-paste")
-            self._split = gui.add_slider(
-                "Compare", 0.0, 1.0, 0.01, 0.0, hint="How much of the width shows what it is compared with"
+        self._right = gui.add_dropdown("Picture", PICTURE_KINDS, initial_value="Light transfer", order=VIEW_ORDER)
+        self._caption = gui.add_html("", order=VIEW_ORDER)
+        with context.more_of("View"):
+            self._left = gui.add_dropdown(
+                "Before", PICTURE_KINDS, initial_value="Copy-paste", hint="Left of the divider, and while Tab is held"
             )
-            self._camera_slider = gui.add_slider("Camera", 0, 1, 1, 0, hint="Step through the target's cameras")
-            self._follow = gui.add_checkbox(
-                "Draw on the canvas", True, hint="Otherwise the canvas shows splats, and the panel the camera's picture"
-            )
+            self._camera_slider = gui.add_slider("Photo", 1, 2, 1, 1, hint="Look from the place of a photo")
             self._frusta = context.on(gui.add_checkbox("Show the cameras", False), self._show_cameras)
-        for control in (self._left, self._right, self._split, self._follow):
+        for control in (self._left, self._right):
             control.on_update(lambda event: self.update() if event.client is not None else None)
-        context.on(self._camera_slider, self._to_camera)
-        context.on(gui.add_command("Previous camera", hotkey="arrowleft"), lambda: self._step(-1))
-        context.on(gui.add_command("Next camera", hotkey="arrowright"), lambda: self._step(1))
+        context.on(self._camera_slider, lambda: self.to_camera(int(self._camera_slider.value) - 1))
 
     def reset(self) -> None:
         """Discard pictures and timings for another project."""
@@ -141,8 +162,9 @@ class PreviewPanel:
 
     def scene_changed(self) -> None:
         """Switch to the cameras of the other scene; the source has only one pair of pictures."""
-        self._left.visible = self._right.visible = self._context.phase != "Select"
-        self._camera_slider.value = 0
+        for control in (self._left, self._right, self._camera_slider):
+            control.visible = self._context.phase != "Select"
+        self._camera_slider.value = 1
         self._drawn = Memo()
         self._show_cameras()
 
@@ -153,8 +175,7 @@ class PreviewPanel:
 
     def camera_moved(self) -> None:
         """Show splats while the editing window's view moves, and its picture when it rests."""
-        if self._follow.value:
-            self._submit(is_moved=True)
+        self._submit(is_moved=True)
 
     def show(self, left: PictureKind, right: PictureKind) -> None:
         """Select the two kinds of pictures."""
@@ -173,12 +194,31 @@ class PreviewPanel:
         pixels = request.draw(request.right).pixels
         write_image(path, torch.from_numpy(pixels.astype(np.float32) / 255))
 
+    def photo(self) -> int | None:
+        """The number of the photo from whose place the editing window sees the scene; None where from elsewhere."""
+        window, cameras = self._context.guarded.editing(), self._context.cameras()
+        if window is None or cameras is None:
+            return None
+        camera = camera_from_viser(window.camera, width=_NO_WINDOW_WIDTH)
+        return standing_at(camera, cameras, scale=self._context.scene_scale())
+
+    def to_camera(self, index: int) -> None:
+        """Move the editing window's view to one of the scene's cameras."""
+        cameras = self._context.cameras()
+        if cameras is not None:
+            self._context.look_through(self._context.guarded.editing(), cameras[index % len(cameras)])
+            self._camera_slider.value = index % len(cameras) + 1
+
+    def step_camera(self, by: int) -> None:
+        """Move the view to the next camera, or the previous one."""
+        photo = self.photo()
+        self.to_camera(int(self._camera_slider.value) - 1 + by if photo is None else photo + by)
+
     # requests
 
     def _submit(self, *, is_moved: bool) -> None:
         request = self._request()
-        self._panel.visible = request is not None
-        self._image.visible = request is not None and request.window is None
+        self._right.visible = request is not None and self._context.phase != "Select"
         self._is_on_canvas = request is not None and request.window is not None
         if request is None or request.window is None or (is_moved and _pose(request.camera) != self._shown_pose):
             self.canvas.clear()
@@ -192,24 +232,26 @@ class PreviewPanel:
             cameras = context.cameras()
         if session is None or cameras is None:
             return None
-        if self._camera_slider.max != max(1, len(cameras) - 1):
-            self._camera_slider.max = max(1, len(cameras) - 1)
-        is_on_canvas = self._follow.value and window is not None and context.phase != "Select"
-        if window is not None and self._follow.value:
-            size, aspect = (self._canvas_width(window), 0.0) if is_on_canvas else (_PANEL_WIDTH, _MIN_ASPECT)
-            camera = camera_from_viser(window.camera, width=width or size, min_aspect=aspect)
+        if self._camera_slider.max != max(2, len(cameras)):
+            self._camera_slider.max = max(2, len(cameras))
+        photo = None
+        if window is not None:
+            camera = camera_from_viser(window.camera, width=width or self._canvas_width(window))
+            photo = standing_at(camera, cameras, scale=context.scene_scale())
         else:
-            camera = cameras[int(self._camera_slider.value)]
-            camera = camera.resized((width or _PANEL_WIDTH) / camera.width)
-        left, right = SOURCE_KINDS if context.phase == "Select" else (self._left.value, self._right.value)
+            camera = cameras[min(int(self._camera_slider.value), len(cameras)) - 1]
+            camera = camera.resized((width or _NO_WINDOW_WIDTH) / camera.width)
+        left, right = self._left.value, self._right.value
+        if context.phase == "Select":
+            left, right = "Source", "Object alone" if self.is_object_alone else "Selection"
         return PictureRequest(
             session=session,
             state=self._dragged_state or session.placed_state(),
             camera=camera,
             left=left,
             right=right,
-            split=float(self._split.value),
-            window=window if is_on_canvas else None,
+            window=window,
+            photo=photo,
             is_dragging=self._dragged_state is not None,
         )
 
@@ -224,19 +266,6 @@ class PreviewPanel:
         cameras = self._context.cameras() if self._frusta.value else None
         self._context.view.show_cameras(cameras, size=0.08 * self._context.scene_scale())
 
-    def _to_camera(self) -> None:
-        cameras = self._context.cameras()
-        if cameras is not None:
-            self._follow.value = False
-            camera = cameras[min(int(self._camera_slider.value), len(cameras) - 1)]
-            self._context.look_through(self._context.guarded.editing(), camera)
-
-    def _step(self, by: int) -> None:
-        cameras = self._context.cameras()
-        if cameras is not None:
-            self._camera_slider.value = (int(self._camera_slider.value) + by) % len(cameras)
-            self._to_camera()
-
     # drawing, in the worker threads
 
     def _work(self, request: PictureRequest) -> None:
@@ -247,20 +276,19 @@ class PreviewPanel:
             self.canvas.clear()
             self._say("the scene is being read")
             return  # drawn when the scenes are there
-        if not {request.left, request.right} & set(NEEDS_LIGHT) or relighting.is_relit(state):
-            self._draw(request, note=self._light_note)
+        if request.right not in NEEDS_LIGHT or relighting.is_relit(state):
+            self._draw(request, note="")
             return
         if relighting.best(state) is None:
             if self._draft_seconds > _MAX_DRAFT_SECONDS:
-                # first the pictures that need no light transfer
-                left, right = ("Copy-paste" if kind in NEEDS_LIGHT else kind for kind in (request.left, request.right))
-                self._draw(replace(request, left=left, right=right), note="light: computing ...", stage="copy-paste")
+                # first the picture that needs no light transfer
+                self._draw(replace(request, right="Copy-paste"), note="light: computing ...", stage="copy-paste")
                 if self._worker.superseded:
                     return
             start = time.monotonic()
             relighting.draft(state)
             self._draft_seconds = time.monotonic() - start
-        self._draw(replace(request, draft=True), note=f"a draft of the light in {self._draft_seconds:.1f} s")
+        self._draw(replace(request, draft=True), note="a draft of the light")
         if not request.is_dragging:
             self._light_worker.submit(request)
 
@@ -273,11 +301,9 @@ class PreviewPanel:
             if not worker.closed:
                 self.update()  # once drawn, asks for the light itself
             return
-        start = time.monotonic()
         relighting.relit(state)
         if worker.closed:
             return
-        self._light_note = f"light in {time.monotonic() - start:.1f} s"
         self.light_ready()
         self.update()
         if worker.wait_idle(_REST_SECONDS):
@@ -294,49 +320,61 @@ class PreviewPanel:
     def _draw_once(self, request: PictureRequest, *, note: str, stage: str) -> None:
         start = time.monotonic()
         problems: list[str] = []
-        left, right = self._both(request, problems)
+        right = self._picture(request, request.right, problems)
         seconds = time.monotonic() - start
-        pixels = wipe_comparison(left.pixels, right.pixels, request.split)
         # the page was closed, or the canvas given to splats, while this picture was drawn
         if self._worker.closed or (request.window is not None and not self._is_on_canvas):
             return
         if request.window is not None:
-            depth = right.depth if request.split < 0.5 else left.depth
-            self.canvas.show(request.window, with_badge(pixels, stage), depth)
+            self.canvas.show(request.window, with_badge(right.pixels, stage), right.depth)
             self._shown_pose = _pose(request.camera)
             self._picture_seconds = seconds if stage != "coarse" else self._picture_seconds
+        self._say(" &middot; ".join((*self._described(request), *filter(None, (note,)), *problems)))
+        if request.window is not None:
+            self._tell(request.window, request, None)
+            self.on_shown(request.camera)
+            if stage in ("draft", "full quality") and request.left != request.right and not self._worker.superseded:
+                left = self._picture(
+                    replace(request, draft=request.draft and request.left in NEEDS_LIGHT), request.left, []
+                )
+                if not self._worker.superseded:
+                    self._tell(request.window, request, left.pixels)
+
+    def _picture(self, request: PictureRequest, kind: PictureKind, problems: list[str]) -> Picture:
+        """One picture; a grey one where it could not be drawn, and the reason is appended to `problems`."""
+        try:
+            return self._drawn.get(kind, request.key(), lambda: request.draw(kind))
+        except ValueError as error:
+            problems.append(str(error))
+            return Picture(np.full((request.camera.height, request.camera.width, 3), 48, np.uint8))
+
+    def _tell(
+        self, window: viser.ClientHandle, request: PictureRequest, before: UInt8[np.ndarray, "h w 3"] | None
+    ) -> None:
+        """Tell the page's script of a window what its canvas shows: what can be grabbed, and the picture before."""
+        state: dict[str, object] = {"window": window.client_id, "hulls": self.outlines(request.camera)}
+        if before is not None:
+            names = [_NAMES.get(kind, kind.lower()) for kind in (request.left, request.right)]
+            state |= {
+                "before": f"data:image/jpeg;base64,{base64.b64encode(jpeg(before, _BEFORE_QUALITY)).decode()}",
+                "names": names,
+            }
+        self._version += 1
+        text = html.escape(json.dumps(state))
+        content = f'<div class="sg-state" data-version="{self._version}" style="display:none">{text}</div>'
+        if self._told is None or self._told[0] != window.client_id:
+            self._told = (window.client_id, window.gui.add_html(content))
         else:
-            self._image.image = pixels
-        self._say(" &middot; ".join((*self._described(request, left), *filter(None, (note,)), *problems)))
+            self._told[1].content = content
 
-    def _both(self, request: PictureRequest, problems: list[str]) -> tuple[Picture, Picture]:
-        """The left and the right picture; one of them alone is drawn where the other one is not seen.
-
-        What could not be drawn is appended to `problems`; that picture is grey.
-        """
-
-        def drawn(kind: PictureKind) -> Picture:
-            try:
-                return self._drawn.get(kind, request.key(), lambda: request.draw(kind))
-            except ValueError as error:
-                problems.append(str(error))
-                return Picture(np.full((request.camera.height, request.camera.width, 3), 48, np.uint8))
-
-        if request.split <= 0 or request.left == request.right:
-            right = drawn(request.right)
-            return right, right
-        left = drawn(request.left)
-        return (left, left) if request.split >= 1 else (left, drawn(request.right))
-
-    def _described(self, request: PictureRequest, picture: Picture) -> list[str]:
-        """What the caption says of a picture."""
-        (height, width), session = picture.pixels.shape[:2], request.session
-        shown, found = (request.left, request.right), [f"{request.left} | {request.right}", f"{width} x {height}"]
-        if "Light transfer" in shown and not session.files.transfers_light:
+    def _described(self, request: PictureRequest) -> list[str]:
+        """What the caption says of the picture."""
+        session, shown, found = request.session, request.right, [request.right]
+        if shown == "Light transfer" and not session.files.transfers_light:
             found.append(session.relighting.light_mode_note())
-        if "Photograph" in shown and session.files.without_photos[1]:
+        if shown == "Photograph" and session.files.without_photos[1]:
             found.append("no photograph: an image rendered of the scene, which has no photographs")
-        why = session.why_stale("consolidate") if "Result" in shown and session.files.result.is_file() else None
+        why = session.why_stale("consolidate") if shown == "Result" and session.files.result.is_file() else None
         if why is not None:
             found.append(f"<b>the result is out of date</b> ({html.escape(why)}): see Run")
         return found

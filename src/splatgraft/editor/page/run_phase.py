@@ -1,48 +1,34 @@
-"""The phase `Run`: run the remaining steps, show which are stale, and share the result in any format of `export`."""
+"""The phase `Run`: makes the result of the edits, or makes it again."""
 
 import html
 import shlex
 from dataclasses import replace
-from pathlib import Path
-from urllib.parse import quote
 
 import viser
 
-from splatgraft.editor import sharing
-from splatgraft.editor.jobs import JobState
 from splatgraft.editor.page.context import PageContext, Phase, note
-from splatgraft.editor.page.job_panel import JobPanel
 from splatgraft.editor.page.preview_panel import PreviewPanel
-from splatgraft.editor.page.server import FILES_PREFIX
-from splatgraft.editor.project import ExportPage, in_words
-from splatgraft.exports.export import Layer
+from splatgraft.editor.session import Session
 from splatgraft.harmonization import HARMONIZERS
-from splatgraft.project.layout import EXPORTS_FOLDER, REPORT_FILE
 
-_LISTED = 6
-"""Shared files that are listed, the newest ones."""
-_SHOWN_SUFFIXES = (".html", ".png", ".jpg", ".webp", ".gif", ".mp4")
-"""Suffixes of files that a browser shows."""
-_PICTURE = "view.png"
+_LABEL = "Update result"
 
 
 class RunPhase(Phase):
     """The controls of the phase."""
 
-    def __init__(self, context: PageContext, preview: PreviewPanel, job: JobPanel) -> None:
+    def __init__(self, context: PageContext, preview: PreviewPanel) -> None:
         """Build the controls."""
         self._context, self._preview, gui = context, preview, context.gui
-        self._method = gui.add_dropdown("Image model", tuple(HARMONIZERS), initial_value="none")
-        self._transfer = gui.add_button("Harmonise and consolidate", icon=viser.Icon.PLAYER_PLAY)
-        self._report = gui.add_button("Make the report", color="gray")
-        self._steps = gui.add_html("")
-        with gui.add_folder("Share"):
-            self._stale = gui.add_html("", visible=False)
-            self._share = SharePanel(context, preview, job)
-            self._link = gui.add_html("")
-        context.on(self._method, self._set_method)
-        context.on(self._transfer, lambda: context.run("consolidate", self._transfer.label))
-        context.on(self._report, lambda: context.run("evaluate", self._report.label))
+        self._note = gui.add_html("")
+        self._update = context.on(gui.add_button(_LABEL, icon=viser.Icon.PLAYER_PLAY), self._run)
+        with context.more_of("Run"):
+            self._method = context.on(
+                gui.add_dropdown("Image model", tuple(HARMONIZERS), initial_value="none"), self._set_method
+            )
+            self._with_report = gui.add_checkbox("With the report", False, hint="A page with numbers and pictures")
+            self._command = gui.add_html("")
+        context.on(self._with_report, lambda: None)
 
     def enter(self) -> None:
         """Compare with the result in the preview."""
@@ -51,143 +37,42 @@ class RunPhase(Phase):
             self._preview.show("Copy-paste", "Result")
 
     def refresh(self) -> None:
-        """Update the target, the table of steps and what can be shared."""
+        """Update the target, and say whether the result is that of the edits."""
         session = self._context.session
         if session is None:
             return
         self._context.show_target()
         self._method.value = session.state.harmonizer or "none"
-        rows = []
-        for name, reason in session.project.reasons().items():
-            mark = "&#10003;" if reason is None else "&middot;"
-            why = f'<td style="opacity:.6">{html.escape(in_words(name, reason or ""))}</td>'
-            rows.append(f'<tr><td style="width:1.4em">{mark}</td><td>{name}</td>{why}</tr>')
-        self._steps.content = note(
-            f"<table>{''.join(rows)}</table>{_command(session.project.run_words('consolidate'))}"
-        )
-        has_report = sharing.has_report(session.files)
-        why_result = session.why_stale("consolidate") if session.files.result.is_file() else None
-        why_report = session.why_stale("evaluate") if has_report else None
-        self._transfer.label = "Bring the result up to date" if why_result else "Harmonise and consolidate"
-        self._report.label = "Bring the report up to date" if why_report else "Make the report"
-        stale = [
-            f"<b>{name}</b>: out of date ({html.escape(why)})"
-            for name, why in (("The result", why_result), ("The report", why_report))
-            if why is not None
-        ]
-        self._stale.visible, self._stale.content = bool(stale), note("<br>".join(stale), kind="stale", bad=True)
-        link = f'<a href="{FILES_PREFIX}{REPORT_FILE}" target="_blank">Open the report</a>' if has_report else ""
-        self._share.refresh()
-        self._link.content = note(f"{link}{' (out of date)' if why_report else ''}")
+        self._note.content = note(self._said(session), kind="result")
+        self._command.content = command_line(session.project.run_words(self._last_step()))
+
+    def result_made(self) -> None:
+        """Show the result that a job has just made."""
+        if self._context.phase == "Run":
+            self.enter()
+
+    def _said(self, session: Session) -> str:
+        why = session.why_stale(self._last_step())
+        if not session.files.result.is_file():
+            return "There is no result yet."
+        return "The result is up to date." if why is None else f"The result is out of date: {html.escape(why)}."
+
+    def _last_step(self) -> str:
+        return "evaluate" if self._with_report.value else "consolidate"
+
+    def _run(self) -> None:
+        self._context.run(self._last_step(), _LABEL)
 
     def _set_method(self) -> None:
         session = self._context.require_session()
         session.change(replace(session.state, harmonizer=self._method.value))
 
 
-class SharePanel:
-    """Writes the result in a job and sends the file to the window; shows the command that does the same, and what was
-    written."""
-
-    def __init__(self, context: PageContext, preview: PreviewPanel, job: JobPanel) -> None:
-        """Build the controls in the current folder of the panel."""
-        self._context, self._preview, gui = context, preview, context.gui
-        self._asked: tuple[int, int] | None = None
-        """The process of the job that writes a file, and the window that asked for it."""
-        self._kind = context.on(gui.add_dropdown("As", tuple(sharing.SHARE_KINDS)), lambda: None)
-        self._part = gui.add_dropdown(
-            "Part", tuple(sharing.PARTS), hint="Parts share the target's frame; pictures of them have alpha"
-        )
-        self._note = gui.add_html("")
-        self._write = gui.add_button("Write and download", icon=viser.Icon.SHARE)
-        self._bar = gui.add_progress_bar(0.0, visible=False, animated=True)
-        self._picture = gui.add_button("Picture of this view", icon=viser.Icon.PHOTO, color="gray")
-        self._written = gui.add_html("")
-        context.on(self._part, lambda: None)
-        self._write.on_click(context.callback(self._start))
-        self._picture.on_click(context.callback(self._send_picture))
-        job.on_progress, job.on_end = self._show_progress, self._job_ended
-
-    def refresh(self) -> None:
-        """Update what can be written, the command and the list of files."""
-        session = self._context.require_session()
-        kind = sharing.SHARE_KINDS[self._kind.value]
-        self._part.visible = kind.page == "viewer"
-        why_not = sharing.why_not(session.files, kind)
-        self._write.disabled = why_not is not None
-        to, page, layer = self._wanted()
-        shown = why_not or _command(session.project.export_words(to, page=page, layer=layer))
-        self._note.content = note(shown, kind="share")
-        self._written.content = note(self._list())
-
-    def _wanted(self) -> tuple[Path, ExportPage, Layer]:
-        """The file to write, and what it holds."""
-        kind = sharing.SHARE_KINDS[self._kind.value]
-        layer = sharing.PARTS[self._part.value] if kind.page == "viewer" else "all"
-        return sharing.export_path(self._context.require_session().files, kind, layer), kind.page, layer
-
-    def _start(self, event: viser.GuiEvent) -> None:
-        to, page, layer = self._wanted()
-        session = self._context.require_session()
-        to.parent.mkdir(parents=True, exist_ok=True)
-        session.start_job(session.project.export_words(to, page=page, layer=layer), f"Write {to.name}")
-        job = session.jobs.state()
-        if job is not None and event.client is not None:
-            self._asked = (job.pid, event.client.client_id)
-        self._context.say(f"{to.name}: being written; you can go on meanwhile")
-
-    def _show_progress(self, job: JobState) -> None:
-        """Show the progress here too: the panel of the job is out of view."""
-        self._bar.visible = job.command[0] == "export"
-        self._bar.value = 100 * job.fraction
-
-    def _job_ended(self, job: JobState) -> None:
-        """Send the file that a job has written to the window that asked for it, and say what the job said."""
-        self._bar.visible = False
-        if job.command[:1] != ("export",):
-            return
-        asked, self._asked = self._asked, None
-        if job.outcome == "cancelled":
-            self._context.say(f"{job.title}: cancelled; nothing was written")
-        if job.outcome != "done":
-            return
-        session, path = self._context.require_session(), Path(job.command[job.command.index("--to") + 1])
-        window = None if asked is None or asked[0] != job.pid else self._context.server.get_clients().get(asked[1])
-        if window is not None:
-            window.send_file_download(path.name, path.read_bytes(), save_immediately=True)
-        said = "; ".join(sentence.removeprefix(f"{path}: ") for sentence in job.said)
-        why = session.why_stale(sharing.step_shown(session.files, is_report="--page" in job.command))
-        stale = "" if why is None else f"; it is out of date ({why})"
-        self._context.say(f"written: {path}; {said}{stale}", bad=why is not None)
-
-    def _send_picture(self, event: viser.GuiEvent) -> None:
-        path = self._context.require_session().files.root / EXPORTS_FOLDER / _PICTURE
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._preview.save_picture(path)
-        if event.client is not None:
-            event.client.send_file_download(path.name, path.read_bytes(), save_immediately=True)
-        self._context.say(f"written: {path}")
-
-    def _list(self) -> str:
-        """The shared files with their sizes, to be opened or downloaded again."""
-        files = self._context.require_session().files
-        newest = max((p.stat().st_mtime_ns for p in (files.result, files.relit) if p.is_file()), default=0)
-        rows = []
-        for path in sharing.written_exports(files)[:_LISTED]:
-            address, stat = f"{FILES_PREFIX}{EXPORTS_FOLDER}/{quote(path.name)}", path.stat()
-            link = f'<a href="{address}" target="_blank">open</a> ' if path.suffix in _SHOWN_SUFFIXES else ""
-            older = " (older than the result)" if stat.st_mtime_ns < newest else ""
-            rows.append(
-                f"{html.escape(path.name)}, {stat.st_size / 1e6:.1f} MB "
-                f'{link}<a href="{address}" download>download</a>{older}'
-            )
-        return "<br>".join(rows)
-
-
-def _command(words: tuple[str, ...]) -> str:
-    """HTML of a command line."""
+def command_line(words: tuple[str, ...]) -> str:
+    """HTML of a command that does the same."""
     shown = html.escape(shlex.join(("splatgraft", *words)))
-    return (
-        '<div style="opacity:.6;margin-top:6px">the same on the command line:</div>'
-        f'<code style="overflow-wrap:anywhere">{shown}</code>'
+    return note(
+        f'the same on the command line:<br><code style="overflow-wrap:anywhere">{shown}</code>',
+        kind="command",
+        faint=True,
     )

@@ -26,11 +26,12 @@ from splatgraft.editor.scene_sample import SceneSample
 from splatgraft.segmentation import Box
 
 Color = tuple[float, float, float]
-TINT: Color = (1.0, 0.45, 0.1)
 _EDGES = np.array([[i, j] for i in range(8) for j in range(i) if bin(i ^ j).count("1") == 1])
 _JPEG_QUALITY = 90
 _DEPTH_SHARE = 0.5
 """Resolution of the depth behind the gizmos over that of the picture."""
+_SORT_SECONDS = 2.0
+"""How long a picture stays behind the splats that take its place."""
 _MAX_DEPTH = 167.0
 """World units; viser stores no more."""
 
@@ -190,6 +191,8 @@ class Canvas:
         """Show the splats of `view` in all windows of a server."""
         self._server, self._view = server, view
         self._window: viser.ClientHandle | None = None
+        self._pixels: UInt8[np.ndarray, "h w 3"] | None = None
+        """The picture that was shown last."""
         self._lock = threading.Lock()
 
     @property
@@ -207,7 +210,7 @@ class Canvas:
         with self._lock:
             if self._window is not None and self._window.client_id != window.client_id:
                 self._show_splats()
-            self._window = window
+            self._window, self._pixels = window, pixels
             with window.atomic():
                 window.scene.set_background_image(pixels, format="jpeg", jpeg_quality=_JPEG_QUALITY, depth=depth)
                 self._set_splats_visible(window, False)
@@ -221,8 +224,17 @@ class Canvas:
         window, self._window = self._window, None
         if window is not None and window.client_id in self._server.get_clients():
             with window.atomic():
-                window.scene.set_background_image(None)
+                # the browser sorts the splats before it draws them: until then the picture stays, behind them
+                if self._pixels is not None:
+                    small = np.ascontiguousarray(self._pixels[::2, ::2])
+                    window.scene.set_background_image(small, format="jpeg", jpeg_quality=_JPEG_QUALITY)
                 self._set_splats_visible(window, True)
+            threading.Timer(_SORT_SECONDS, self._remove_picture, (window,)).start()
+
+    def _remove_picture(self, window: viser.ClientHandle) -> None:
+        with self._lock:
+            if self._window is None and window.client_id in self._server.get_clients():
+                window.scene.set_background_image(None)
 
     def _set_splats_visible(self, window: viser.ClientHandle, visible: bool) -> None:
         # to this window alone: others show splats

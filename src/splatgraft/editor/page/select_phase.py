@@ -1,4 +1,4 @@
-"""The phase `Select`: select the object in the source by masks or a box, with corrections by hand and by a brush."""
+"""The phase `Select`: select the object by clicks in photos or in the scene, by masks or a box, and by a brush."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,9 +12,18 @@ from torch import Tensor
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.page.context import PageContext, Phase, note
 from splatgraft.editor.page.handles import BoxHandles
-from splatgraft.editor.page.photo_clicks import PhotoClicks
-from splatgraft.editor.page.scene_view import TINT, Color, camera_from_viser, ray_from_viser
-from splatgraft.editor.picking import Ray, Rectangle, brush_selection, in_rectangle, interpolate_rays
+from splatgraft.editor.page.preview_panel import PreviewPanel
+from splatgraft.editor.page.scene_view import Color, camera_from_viser, ray_from_viser
+from splatgraft.editor.photo_view import PhotoView, seen_best, with_click
+from splatgraft.editor.picking import (
+    Ray,
+    Rectangle,
+    brush_selection,
+    first_surface_hit,
+    in_rectangle,
+    interpolate_rays,
+)
+from splatgraft.editor.pictures import TINT
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import BoxNumbers
 from splatgraft.editor.worker import LatestOnlyWorker
@@ -28,6 +37,10 @@ _SOURCES = {
     "no masks: everything inside the box": "box",
 }
 _KEEP: tuple[str, ...] = get_args(Keep)
+_CLICKS = ("the object", "what is beside it")
+_STROKES = ("removes", "adds")
+_TAKES_POINTS = (None, "auto", "grabcut", "sam2")
+"""Values of `mask_source` of which clicks count."""
 _ADDS: Color = (0.2, 0.9, 0.3)
 _REMOVES: Color = (0.9, 0.1, 0.2)
 _CANVAS, _STROKE = "/brush/canvas", "/source/stroke"
@@ -36,28 +49,31 @@ _CANVAS, _STROKE = "/brush/canvas", "/source/stroke"
 class SelectPhase(Phase):
     """The controls of the phase, and the source in the 3D view."""
 
-    def __init__(self, context: PageContext) -> None:
+    def __init__(self, context: PageContext, preview: PreviewPanel) -> None:
         """Build the controls."""
-        self._context, gui = context, context.gui
-        self._count = gui.add_html("")
-        self._source = gui.add_dropdown("Masks from", tuple(_SOURCES))
-        self._show_box = context.on(gui.add_checkbox("Box around the object", False), self._toggle_box)
-        self._lower = gui.add_vector3("Box from", (0.0, 0.0, 0.0), step=0.001, visible=False)
-        self._upper = context.on(gui.add_vector3("Box to", (0.0, 0.0, 0.0), step=0.001, visible=False), self._box_typed)
-        self._keep = context.on(gui.add_dropdown("Keep pieces", _KEEP), lambda: self._set(keep=self._keep.value))
+        self._context, self._preview, gui = context, preview, context.gui
+        self._note = gui.add_html("")
+        self._kind = context.on(gui.add_dropdown("A click marks", _CLICKS), lambda: None)
+        self._photo = gui.add_slider("Photo", 1, 2, 1, 1, hint="Also by the arrow keys; drag the view to leave it")
         self._cut = gui.add_button("Cut out the object", icon=viser.Icon.WAND)
-        self._photos = PhotoClicks(context)
-        with gui.add_folder("Correct by hand"):
-            self._mode = gui.add_dropdown("Strokes", ("remove", "add"))
-            self._use_brush = gui.add_checkbox("Brush", False, hint="Drag or click on the picture (key B)")
-            self._size = gui.add_slider(
-                "Brush size", 0.01, 0.5, 0.01, 0.1, hint="Diameter over the distance to the surface"
+        self._use_brush = gui.add_checkbox(
+            "Brush", False, hint="Drag over the picture (key B); Shift and drag: a rectangle"
+        )
+        self._mode = gui.add_dropdown("The brush", _STROKES)
+        self._isolate = context.on(gui.add_checkbox("Object alone", False), self._set_alone)
+        with context.more_of("Select"):
+            self._clear_points = context.on(gui.add_button("Forget all clicks", color="gray"), self._remove_clicks)
+            self._size = gui.add_slider("Brush size", 0.01, 0.5, 0.01, 0.1, hint="Over the distance to the surface")
+            self._clear = gui.add_button("Forget all strokes", icon=viser.Icon.ERASER, color="gray")
+            self._source = gui.add_dropdown("Outlines from", tuple(_SOURCES))
+            self._keep = context.on(gui.add_dropdown("Keep pieces", _KEEP), lambda: self._set(keep=self._keep.value))
+            self._show_box = context.on(gui.add_checkbox("Box around the object", False), self._toggle_box)
+            self._lower = gui.add_vector3("Box from", (0.0, 0.0, 0.0), step=0.001, visible=False)
+            self._upper = context.on(
+                gui.add_vector3("Box to", (0.0, 0.0, 0.0), step=0.001, visible=False), self._box_typed
             )
-            gui.add_markdown("Shift and drag: a rectangle.")
             self._show_correction_box = gui.add_checkbox("Second box", False, hint="Adds or removes everything in it")
             self._box_group = gui.add_button_group("All in it", ("Add", "Remove"), visible=False)
-            self._clear = gui.add_button("Clear all strokes", icon=viser.Icon.ERASER, color="gray")
-        self._isolate = context.on(gui.add_checkbox("Show the object alone", False), lambda: None)
         server, view = context.server, context.view
         self._handles = BoxHandles(server, view, "/source/box", color=(255, 150, 40), on_dragged=self._box_dragged)
         self._correction_handles = BoxHandles(server, view, "/source/correction_box", color=(60, 160, 255))
@@ -65,10 +81,13 @@ class SelectPhase(Phase):
         self._shown_box: BoxNumbers | None = None
         """What the fields of the box show. They are written only where the state has something else: the value of a
         refresh would arrive while the next number is typed, and replace it."""
+        self._is_listening = False
+        context.on(self._photo, lambda: preview.to_camera(int(self._photo.value) - 1))
         context.on(self._source, lambda: self._set(mask_source=_SOURCES[self._source.value]))
         context.on(self._lower, self._box_typed)
         context.on(self._cut, lambda: context.run("segment", "Cut out the object"))
         context.on(self._use_brush, self._say_brush)
+        context.on(self._mode, lambda: None)
         context.on(self._size, lambda: None)
         context.on(self._show_correction_box, self._toggle_correction_box)
         context.on(self._box_group, self._apply_box)
@@ -83,17 +102,17 @@ class SelectPhase(Phase):
         """Hide what belongs to the phase alone."""
         self._context.server.scene.remove_rect_select_callback(self._rectangle_drawn)
         self._brush.deactivate()
-        self._photos.leave()
+        self._listen(False)
         self._handles.hide()
         self._correction_handles.hide()
 
     def refresh(self) -> None:
-        """Update the source in the view, selection, counts and box."""
+        """Update the source in the view, the note and the box."""
         session = self._context.session
         if session is None:
             return
         if not session.files.source_scene.is_file():
-            self._count.content = note("The source is not reconstructed yet: see Open.")
+            self._note.content = note("The scene with the object is not there yet: see Open.")
             return
         if not self._is_read(session):
             return
@@ -106,23 +125,80 @@ class SelectPhase(Phase):
         if state.box is not None and state.box != self._shown_box:
             self._lower.value, self._upper.value = state.box[:3], state.box[3:]
             self._shown_box = state.box
-        self._clear.disabled = state.corrections is None
+        self._clear.disabled, self._clear_points.disabled = state.corrections is None, state.prompts is None
+        self._mode.visible = self._use_brush.value
+        self._show_photo()
         self._draw(session)
-        # last, as it hides the splats
-        self._photos.refresh()
-        if self._photos.is_shown:
-            self._show_correction_box.value = False
         self._box_group.visible = self._show_correction_box.value
         if not self._show_correction_box.value:
             self._correction_handles.hide()
-        if box is not None and not self._photos.is_shown:
+        if box is not None:
             self._handles.show(box)
         else:
             self._handles.hide()
-        if self._use_brush.value and not self._photos.is_shown:
+        if self._use_brush.value:
             self._brush.activate(session.scenes.gaussians(session.files.source_scene), size=float(self._size.value))
         else:
             self._brush.deactivate()
+        self._listen(not self._use_brush.value)
+
+    def view_shown(self) -> None:
+        """Show which photo the view stands at, once it rests."""
+        self._show_photo()
+
+    def _show_photo(self) -> None:
+        cameras, photo = self._context.cameras(), self._preview.photo()
+        if cameras is not None and self._photo.max != max(2, len(cameras)):
+            self._photo.max = max(2, len(cameras))
+        if photo is not None and self._photo.value != photo + 1:
+            self._photo.value = photo + 1
+
+    def _set_alone(self) -> None:
+        self._preview.is_object_alone = self._isolate.value
+
+    # clicks
+
+    def _listen(self, wanted: bool) -> None:
+        if wanted and not self._is_listening:
+            self._context.server.scene.on_click()(self._clicked)
+        elif self._is_listening and not wanted:
+            self._context.server.scene.remove_click_callback(self._clicked)
+        self._is_listening = wanted
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        self._context.callback(self._mark)(event)
+
+    def _mark(self, event: viser.SceneClickEvent) -> None:
+        """Add a point to the photo from whose place the scene is seen, else to the one that sees it most alike."""
+        session = self._context.require_session()
+        capture, photo = session.scenes.capture(session.files.source_cameras), self._preview.photo()
+        if photo is not None:
+            window = event.client.camera
+            size = session.pictures.photo(photo)[1]
+            width = max(16, window.image_width)
+            pixel = PhotoView(size, (width, max(16, round(width / window.aspect)))).pixel_at(event.screen_pos)
+            if pixel is None:
+                raise ValueError("click: expected a place in the photo, found one beside it")
+        else:
+            ray = ray_from_viser(event)
+            hit = first_surface_hit(self._scene(), ray.origin, ray.direction)
+            if hit is None:
+                raise ValueError("click: expected a surface of the scene under the pointer, found none")
+            photo, pixel = seen_best(hit, ray.direction, capture.cameras)
+            size = session.pictures.photo(photo)[1]
+            scale = size[0] / capture.cameras[photo].width
+            pixel = (pixel[0] * scale, pixel[1] * scale)
+        name, on_object = capture.cameras.names[photo], self._kind.value == _CLICKS[0]
+        prompts = with_click(session.state.prompts, name, pixel, on_object=on_object, longer_side=max(size))
+        state, takes = replace(session.state, prompts=prompts), session.state.mask_source in _TAKES_POINTS
+        session.change(state if takes else replace(state, mask_source="auto"))
+        count = sum(len(p.inside) + len(p.outside) for p in (prompts or {}).values())
+        clicks = "1 click" if count == 1 else f"{count} clicks"
+        others = "" if takes else "; outlines are found by clicks now"
+        self._context.say(f"{clicks} in {len(prompts or {})} of the photos{others}; cut out again to use them")
+
+    def _remove_clicks(self) -> None:
+        self._set(prompts=None)
 
     def _is_read(self, session: Session) -> bool:
         """Whether the source is at hand; otherwise a sample of it is shown until it is."""
@@ -130,7 +206,7 @@ class SelectPhase(Phase):
         if scenes.at_hand([path]):
             return True
         self._context.view.show_coarse(path, scenes.sample(path))
-        self._count.content = note(scenes.reading_note(path))
+        self._note.content = note(scenes.reading_note(path))
         return False
 
     def _draw(self, session: Session) -> None:
@@ -142,10 +218,14 @@ class SelectPhase(Phase):
         else:
             view.show_splats("/source/rest", scene, which=session.scenes.complement("selected", selection))
         view.remove_coarse()
-        kind = "the object" if session.scenes.segmented() is not None else "inside the box"
-        shown = [s for n, s in view.shown.items() if n.startswith("/source") and s.count < s.total]
-        limited = f"<br>{sum(s.count for s in shown):,} are shown; the files contain all" if shown else ""
-        self._count.content = note(f"<b>{int(selection.sum()):,}</b> of {scene.count:,} Gaussians are {kind}{limited}")
+        # without any mask or box nothing is selected yet
+        if not bool(selection.any()):
+            text = "Click on the object, in two or three photos; then cut it out."
+        elif session.scenes.segmented() is not None:
+            text = "The object is orange. Where it is wrong, click or brush, and cut it out again."
+        else:
+            text = "What is in the box is orange. Cut it out, or click on the object in two or three photos first."
+        self._note.content = note(text, kind="selection")
 
     def _scene(self) -> Gaussians:
         session = self._context.require_session()
@@ -202,8 +282,7 @@ class SelectPhase(Phase):
             self._correction_handles.show(box.grown(1.1))
 
     def _rectangle_drawn(self, event: viser.SceneRectSelectEvent) -> None:
-        if not self._photos.is_shown:
-            self._context.callback(self._apply_rectangle)(event)
+        self._context.callback(self._apply_rectangle)(event)
 
     def _apply_rectangle(self, event: viser.SceneRectSelectEvent) -> None:
         camera = camera_from_viser(event.client.camera, width=1000)
@@ -216,7 +295,7 @@ class SelectPhase(Phase):
         self._correct(inside, add=self._box_group.value == "Add")
 
     def _adds(self) -> bool:
-        return self._mode.value == "add"
+        return self._mode.value == _STROKES[1]
 
     def _apply_stroke(self, touched: Tensor) -> None:
         self._correct(touched, add=self._adds())
@@ -224,7 +303,7 @@ class SelectPhase(Phase):
     def _correct(self, touched: Tensor, *, add: bool) -> None:
         self._context.require_session().correct(touched, add=add)
         done = "added" if add else "removed"
-        self._context.say(f"{done}: {int(touched.sum()):,} Gaussians under the stroke; cut again to use it")
+        self._context.say(f"{done} what the stroke touched; cut out again to use it")
 
 
 class Brush:

@@ -1,14 +1,18 @@
 """A viser server behind access control, of whose windows the oldest edits and all others only watch."""
 
+import asyncio
 import contextlib
+import gzip
 import http
 import http.client
 import io
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Mapping
 from functools import partial
+from importlib import resources
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
+from urllib.parse import parse_qsl, unquote
 
 import viser
 import websockets.asyncio.server
@@ -20,6 +24,13 @@ from splatgraft.editor.access import allowed_query, cookie_name, why_refused
 
 FILES_PREFIX = "files/"
 """First part of the addresses of files, below the page's own address."""
+HAND_PREFIX, _ALIVE = "hand/", "alive"
+"""First part of the addresses that the page's script asks, and the address at which it asks whether the server runs."""
+_ASSETS = ("page.js", "page.css")
+"""Files beside this one that viser's page is given."""
+_HEAD = b'<link rel="stylesheet" href="page.css"><script src="page.js" defer></script></head>'
+Answer = Callable[[Mapping[str, str]], bytes | None]
+"""Takes the query of a request of the page's script, and gives a JPEG picture or nothing."""
 _CAMERA_MESSAGES = (_messages.ViewerCameraMessage, _messages.GetRenderResponseMessage)
 _TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -44,6 +55,8 @@ class GuardedServer:
         self.on_windows_changed: Callable[[], None] = lambda: None
         self.files: Callable[[str], Path | None] = lambda name: None
         """Gives the file that is served below FILES_PREFIX."""
+        self.hands: dict[str, Answer] = {}
+        """What answers the page's script below HAND_PREFIX, by name; each runs in a thread."""
         self._token = token
         self._windows: list[int] = []
         # viser has no hook for requests: websockets.serve is replaced while viser starts
@@ -93,32 +106,81 @@ class GuardedServer:
         answer = partial(self._answer, options["process_request"])
         return original(handler, *args, **options | {"process_request": answer})
 
-    def _answer(self, inner: Callable[..., Response | None], connection: Any, request: Request) -> Response | None:
+    async def _answer(
+        self, inner: Callable[..., Response | None], connection: Any, request: Request
+    ) -> Response | None:
         # a repeated header is joined, so that it matches no accepted value
         found = {name: request.headers.get_all(name) for name in ("Host", "Origin", "Upgrade", "Cookie")}
         headers = {name: ("; " if name == "Cookie" else ", ").join(values) for name, values in found.items() if values}
         refused = why_refused(self._token, headers, request.path)
         if refused is not None:
             return _response(http.HTTPStatus.FORBIDDEN, f"splatgraft: {refused}\n".encode(), "text/plain")
-        path, query = request.path.partition("?")[0].removeprefix("/"), allowed_query(request.path)
-        if query is not None and "Upgrade" not in request.headers:
-            moved = _response(http.HTTPStatus.FOUND, b"", "text/plain")
-            moved.headers["Location"] = query
-            return moved
-        if path.startswith(FILES_PREFIX):
-            file = self.files(unquote(path.removeprefix(FILES_PREFIX)))
-            if file is None:
-                return _response(http.HTTPStatus.NOT_FOUND, b"splatgraft: no such file\n", "text/plain")
-            kind = _TYPES.get(file.suffix, "application/octet-stream")
-            return _response(http.HTTPStatus.OK, file.read_bytes(), kind)
+        if "Upgrade" not in request.headers:
+            own = await self._own(request.path)
+            if own is not None:
+                return own
         response = inner(connection, request)
         if response is not None:
+            if response.headers.get("Content-Type", "").startswith("text/html"):
+                self._add_assets(response)
             cookie = f"{cookie_name(headers['Host'])}={self._token}; HttpOnly; SameSite=Strict; Path=/"
             response.headers["Set-Cookie"] = cookie
             # no other site may embed this page in a frame (clickjacking), and the address holds the token
             response.headers["X-Frame-Options"] = "DENY"
             response.headers["Referrer-Policy"] = "no-referrer"
         return response
+
+    async def _own(self, address: str) -> Response | None:
+        """The answer to what is not part of viser's page; None for what is."""
+        path, _, query = address.removeprefix("/").partition("?")
+        if path.startswith(HAND_PREFIX):
+            return await asyncio.to_thread(self._ask, path.removeprefix(HAND_PREFIX), query)
+        allowed = allowed_query(address)
+        if allowed is not None:
+            moved = _response(http.HTTPStatus.FOUND, b"", "text/plain")
+            moved.headers["Location"] = allowed
+            return moved
+        if path == _ALIVE:
+            return _response(http.HTTPStatus.NO_CONTENT, b"", "text/plain")
+        if path in _ASSETS:
+            content = resources.files("splatgraft.editor.page").joinpath(path).read_bytes()
+            return _response(http.HTTPStatus.OK, content, _TYPES[Path(path).suffix])
+        return self._file(unquote(path.removeprefix(FILES_PREFIX))) if path.startswith(FILES_PREFIX) else None
+
+    def _file(self, name: str) -> Response:
+        file = self.files(name)
+        if file is None:
+            return _response(http.HTTPStatus.NOT_FOUND, b"splatgraft: no such file\n", "text/plain")
+        return _response(http.HTTPStatus.OK, file.read_bytes(), _TYPES.get(file.suffix, "application/octet-stream"))
+
+    def _ask(self, name: str, query: str) -> Response:
+        """Answer the page's script; only in the window that edits it is heard."""
+        given, editing = dict(parse_qsl(query)), self.editing()
+        answer = self.hands.get(name)
+        if answer is None:
+            return _response(http.HTTPStatus.NOT_FOUND, b"splatgraft: no such request\n", "text/plain")
+        if editing is None or given.get("window") != str(editing.client_id):
+            return _response(http.HTTPStatus.FORBIDDEN, b"splatgraft: another window edits\n", "text/plain")
+        try:
+            picture = answer(given)
+        except (ValueError, KeyError) as error:
+            return _response(http.HTTPStatus.BAD_REQUEST, f"splatgraft: {error}\n".encode(), "text/plain")
+        except Exception as error:  # a programming error must be visible
+            traceback.print_exception(error)
+            return _response(http.HTTPStatus.INTERNAL_SERVER_ERROR, f"splatgraft: {error}\n".encode(), "text/plain")
+        if picture is None:
+            return _response(http.HTTPStatus.NO_CONTENT, b"", "text/plain")
+        return _response(http.HTTPStatus.OK, picture, "image/jpeg")
+
+    @staticmethod
+    def _add_assets(response: Response) -> None:
+        """Add the page's script and style to viser's page."""
+        is_packed = response.headers.get("Content-Encoding") == "gzip"
+        body = gzip.decompress(response.body) if is_packed else response.body
+        body = body.replace(b"</head>", _HEAD, 1)
+        response.body = gzip.compress(body, compresslevel=1) if is_packed else body
+        del response.headers["Content-Length"]
+        response.headers["Content-Length"] = str(len(response.body))
 
     async def _forward_allowed(self, inner: Callable[..., Any], window: int, message: Any) -> None:
         """Forward messages of the window that edits, and camera messages of all windows."""

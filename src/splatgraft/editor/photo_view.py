@@ -1,0 +1,145 @@
+"""A photo of a capture on the canvas, and the clicks in it that say what is the object and what is not."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import PurePath
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.prompts import ViewPrompt
+
+_SAME_VIEW = 2e-3
+"""Distance over that of the scene, plus that of the unit directions, below which a view is that of a camera."""
+_NEAR = 0.012
+"""A click this near to a point removes it; distance over the photo's longer side."""
+_RADIUS = 0.007
+"""Radius of a drawn point over the canvas's longer side."""
+_INSIDE, _OUTSIDE, _EDGE = (60, 220, 90), (235, 40, 60), (255, 255, 255)
+_BACKGROUND = 24
+"""Grey beside the photo, 0 to 255."""
+
+
+@dataclass(frozen=True)
+class PhotoView:
+    """A photo in the middle of a canvas, as large as it fits."""
+
+    photo: tuple[int, int]
+    """Width and height of the photo as a viewer shows it, pixels."""
+    canvas: tuple[int, int]
+    """Width and height of the canvas, pixels."""
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the canvas over those of the photo."""
+        return min(self.canvas[0] / self.photo[0], self.canvas[1] / self.photo[1])
+
+    @property
+    def corner(self) -> tuple[float, float]:
+        """The photo's upper left corner on the canvas, pixels."""
+        x, y = (0.5 * (side - self.scale * of) for side, of in zip(self.canvas, self.photo, strict=True))
+        return x, y
+
+    def pixel_at(self, place: tuple[float, float]) -> tuple[float, float] | None:
+        """The photo's pixel at a place, over the canvas's width and height; None beside the photo."""
+        (left, top), (width, height) = self.corner, self.photo
+        x, y = (place[0] * self.canvas[0] - left) / self.scale, (place[1] * self.canvas[1] - top) / self.scale
+        return (x, y) if 0 <= x < width and 0 <= y < height else None
+
+    @property
+    def drawn_size(self) -> tuple[int, int]:
+        """Width and height of the photo on the canvas, pixels."""
+        left, top = (round(x) for x in self.corner)
+        width, height = (max(1, round(self.scale * side)) for side in self.photo)
+        return min(width, self.canvas[0] - left), min(height, self.canvas[1] - top)
+
+    def drawn(self, pixels: UInt8[np.ndarray, "h w 3"], prompt: ViewPrompt) -> UInt8[np.ndarray, "y x 3"]:
+        """The canvas: the photo of any size, with the points and the rectangle of a prompt."""
+        left, top = (round(x) for x in self.corner)
+        width, height = self.drawn_size
+        out = np.full((self.canvas[1], self.canvas[0], 3), _BACKGROUND, np.uint8)
+        out[top : top + height, left : left + width] = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+        radius = max(3, round(_RADIUS * max(self.canvas)))
+
+        def at(x: float, y: float) -> tuple[int, int]:
+            return round(self.corner[0] + self.scale * x), round(self.corner[1] + self.scale * y)
+
+        if prompt.box is not None:
+            cv2.rectangle(out, at(*prompt.box[:2]), at(*prompt.box[2:]), _INSIDE, max(1, radius // 3))
+        for points, color in ((prompt.inside, _INSIDE), (prompt.outside, _OUTSIDE)):
+            for x, y in points.tolist():
+                cv2.circle(out, at(x, y), radius + 2, _EDGE, -1, cv2.LINE_AA)
+                cv2.circle(out, at(x, y), radius, color, -1, cv2.LINE_AA)
+        return out
+
+
+def prompt_of(prompts: Mapping[str, ViewPrompt] | None, name: str) -> ViewPrompt:
+    """What is said in one photo; nothing where it is not named."""
+    return (prompts or {}).get(_key(prompts or {}, name), ViewPrompt())
+
+
+def with_click(
+    prompts: Mapping[str, ViewPrompt] | None,
+    name: str,
+    pixel: tuple[float, float],
+    *,
+    on_object: bool,
+    longer_side: int,
+) -> dict[str, ViewPrompt] | None:
+    """The prompts with one more point, or without the point that was clicked; None where none is left.
+
+    `pixel` is x and y of the photo of that name as a viewer shows it, whose `longer_side` is in pixels.
+    """
+    found, key = dict(prompts or {}), _key(prompts or {}, name)
+    prompt, point = found.get(key, ViewPrompt()), torch.tensor([pixel]).round(decimals=1)
+    near = {kind: (getattr(prompt, kind) - point).norm(dim=1) < _NEAR * longer_side for kind in ("inside", "outside")}
+    if any(bool(flags.any()) for flags in near.values()):
+        prompt = replace(prompt, **{kind: getattr(prompt, kind)[~flags] for kind, flags in near.items()})
+    else:
+        kind = "inside" if on_object else "outside"
+        prompt = replace(prompt, **{kind: torch.cat([getattr(prompt, kind), point])})
+    found[key] = prompt
+    if not len(prompt.inside) and not len(prompt.outside) and prompt.box is None:
+        del found[key]
+    return found or None
+
+
+def standing_at(view: Cameras, cameras: Cameras, *, scale: float) -> int | None:
+    """The number of the camera at which a view stands and looks the same way; None where there is none.
+
+    `scale` is a typical distance of the scene, world units.
+    """
+    pose, poses = view.world_from_camera[0], cameras.world_from_camera
+    far = (poses[:, :3, 3] - pose[:3, 3]).norm(dim=1) / scale + (poses[:, :3, 2] - pose[:3, 2]).norm(dim=1)
+    index = int(far.argmin())
+    return index if float(far[index]) < _SAME_VIEW else None
+
+
+def seen_best(
+    point: Float[Tensor, "3"], direction: Float[Tensor, "3"], cameras: Cameras
+) -> tuple[int, tuple[float, float]]:
+    """The camera that sees a point most nearly along a direction, and its pixel there.
+
+    ValueError where no camera has the point in its picture. What stands before the point is not regarded.
+    """
+    local = torch.einsum("vij,vj->vi", cameras.camera_from_world[:, :3, :3], point - cameras.centers)
+    pixels = torch.einsum("vij,vj->vi", cameras.intrinsics, local)
+    pixels = pixels[:, :2] / local[:, 2:].clamp_min(1e-9)
+    inside = ((pixels >= 0) & (pixels < cameras.sizes)).all(1) & (local[:, 2] > 0)
+    if not bool(inside.any()):
+        raise ValueError("click: expected a place that a photo shows, found none")
+    seen = torch.nn.functional.normalize(point - cameras.centers, dim=1)
+    alike = torch.where(inside, seen @ torch.nn.functional.normalize(direction, dim=0), -2.0)
+    index = int(alike.argmax())
+    x, y = pixels[index].tolist()
+    return index, (x, y)
+
+
+def _key(prompts: Mapping[str, ViewPrompt], name: str) -> str:
+    """How the prompts call a photo: by its name, with or without folder and suffix."""
+    path = PurePath(name)
+    return next((key for key in (name, path.name, path.stem) if key in prompts), name)
