@@ -41,7 +41,7 @@ HIDDEN = "h1, .corner, .bar, #divider, #message { opacity: 0 }"
 """What lies over the canvas would be compared as well."""
 CLOSE_DB = 35.0
 """The scene in 8 bits, drawn by a rasteriser that ends Gaussians earlier than ours and stores colours in 16 bits:
-37.8 dB were measured here, 38.3 for the demo; before and after are 21 apart."""
+36.7 dB and more were measured here, 38.1 for the demo; before and after are 21 apart."""
 
 
 @pytest.fixture(scope="module")

@@ -196,7 +196,7 @@ _PAGE = """<!doctype html>
 <body data-state="loading">
 <canvas id="canvas" tabindex="0" role="img" aria-busy="true" aria-label="{title}. Drag or use the arrow keys to turn,
 plus and minus to come nearer, Home to go back."></canvas>
-<div id="still"><img alt="" style="height: clamp(100%, {still_width}, {still_tallest})"
+<div id="still"><img alt="" decoding="sync" style="height: clamp(100%, {still_width}, {still_tallest})"
 src="data:image/webp;base64,{still}"></div>
 <div id="divider" role="slider" tabindex="0" aria-label="Share of the picture before the change" aria-valuemin="0"
 aria-valuemax="100" aria-valuenow="{split}" style="left: {split}%"{hidden}>{divider}</div>

@@ -15,7 +15,10 @@
   const fail = (text) => { say(text); document.body.dataset.state = "failed"; };
 
   // the still stands on the screen before the engine takes the processor; a page in the background has no frames
-  await new Promise((done) => { requestAnimationFrame(() => setTimeout(done)); setTimeout(done, 300); });
+  await new Promise((done) => {
+    get("still").firstElementChild.decode().finally(() => requestAnimationFrame(() => setTimeout(done))).catch(() => {});
+    setTimeout(done, 500);
+  });
   if (!window.DecompressionStream) return fail("This browser is too old to show the scene.");
   const unpacked = new Blob([bytes("engine")]).stream().pipeThrough(new DecompressionStream("gzip"));
   const script = document.createElement("script");
