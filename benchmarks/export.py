@@ -52,7 +52,8 @@ def page_psnr(path: Path, source: ExportSource) -> tuple[float, float]:
         page.goto(path.as_uri())
         page.wait_for_selector("body[data-state=ready]", timeout=600_000)
         seconds = time.perf_counter() - start
-        page.add_style_tag(content="h1, .corner, .bar { opacity: 0 }")
+        page.add_style_tag(content="h1, .corner, .bar, #divider { opacity: 0 }")
+        page.keyboard.press("b")  # the result alone, where there are two scenes
         page.wait_for_selector("body[data-still=true]", timeout=600_000)
         shown = torch.from_numpy(np.array(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))).float() / 255
         browser.close()

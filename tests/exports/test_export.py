@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from format_files import random_gaussians
+from format_files import parts_of_glb, random_gaussians
 from PIL import Image
 from small_transfer import parts, write_transfer
 
@@ -173,6 +173,8 @@ def test_up_becomes_minus_y_by_a_rotation(up):
 def test_a_glb_is_upright_and_in_metres(project, source, tmp_path, capsys):
     assert main(["export", str(project), "--to", str(tmp_path / "a.glb"), "--layer", "object"]) == 0
     assert "turned upright" in capsys.readouterr().err
+    content, _ = parts_of_glb((tmp_path / "a.glb").read_bytes())
+    assert content["asset"]["extras"] == {"up": pytest.approx([0, 1, 0]), "metres_per_unit": 1}
     g = read_gaussians(tmp_path / "a.glb")  # back in the axes of a .ply: up is -y
     ball = parts()["relit"]
     # the middle of the ball, 0.3 units above the plane, of 0.5 m each

@@ -5,35 +5,43 @@ The engine inside is also the reader of .glb that is not ours.
 
 import base64
 import io
+import math
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from editor_driver import ARGUMENTS, browser_path
 from format_files import TOOLS
 from PIL import Image
-from small_transfer import write_transfer
+from small_transfer import darkened, write_transfer
 from test_scenes_of_other_tools import GLB, assert_within
+from tiny_project import plane
 from waiting import HANG_LIMIT
 
 from splatgraft import formats
 from splatgraft.cli import main
-from splatgraft.core.gaussians import Gaussians
-from splatgraft.exports.export_source import first_view
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.splitting import split_along
+from splatgraft.exports.export_source import FirstView, first_view
+from splatgraft.exports.pages import write_viewer_page
 from splatgraft.folders.export_source import read_export_source
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
 from splatgraft.rendering import render
 
 ENGINE = files("splatgraft.exports") / "viewer" / "playcanvas.js"
 SIZE = (480, 360)
+HIDDEN = "h1, .corner, .bar, #divider, #message { opacity: 0 }"
+"""What lies over the canvas would be compared as well."""
 CLOSE_DB = 35.0
 """The scene in 8 bits, drawn by a rasteriser that ends Gaussians earlier than ours and stores colours in 16 bits:
-37.8 dB were measured here, 38.3 for the demo; before and after are 21 apart."""
+36.7 dB and more were measured here, 38.1 for the demo; before and after are 21 apart."""
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +70,8 @@ def page_file(project) -> Path:
 class Page:
     """An open page, with everything that it asked for."""
 
-    def __init__(self, browser: Any, file: Path, **context: Any) -> None:
-        self.context = browser.new_context(offline=True, viewport={"width": SIZE[0], "height": SIZE[1]}, **context)
+    def __init__(self, browser: Any, file: Path, size: tuple[int, int] = SIZE, **context: Any) -> None:
+        self.context = browser.new_context(offline=True, viewport={"width": size[0], "height": size[1]}, **context)
         self.context.set_default_timeout(1000 * HANG_LIMIT)
         self.page = self.context.new_page()
         self.requests: list[str] = []
@@ -74,26 +82,41 @@ class Page:
         self.page.goto(file.as_uri())
         self.page.wait_for_selector("body[data-state=ready], body[data-state=failed]")
         assert self.page.get_attribute("body", "data-state") == "ready", self.page.inner_text("#message")
-        # what lies over the canvas would be compared as well
-        self.page.add_style_tag(content="h1, .corner, .bar { opacity: 0 }")
+        self.page.add_style_tag(content=HIDDEN)
 
     def picture(self) -> torch.Tensor:
         """The canvas, when the page has drawn all that changed."""
         self.page.wait_for_selector("body[data-still=true]")
-        return torch.from_numpy(np.array(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB"))).float() / 255
+        return screenshot(self.page)
+
+
+def screenshot(page: Any) -> torch.Tensor:
+    return torch.from_numpy(np.array(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))).float() / 255
 
 
 def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(-10 * torch.log10((a - b).square().mean()))
 
 
-def ours(project: Path) -> tuple[torch.Tensor, torch.Tensor]:
-    """Before and after from the page's first view, drawn by our renderer."""
+def ours(project: Path, size: tuple[int, int] = SIZE) -> tuple[torch.Tensor, torch.Tensor]:
+    """Before and after from the page's first view, drawn by our renderer.
+
+    A page that is narrower than the view shows its width, up to twice the height.
+    """
     source = read_export_source(project)
     assert source.pasted is not None
-    camera = first_view(source)[0].camera(SIZE[0])
+    view = first_view(source)[0]
+    tangent = math.tan(math.radians(view.fov_deg) / 2) * min(max(1, view.aspect * size[1] / size[0]), 2)
+    view = replace(view, fov_deg=2 * math.degrees(math.atan(tangent)), aspect=size[0] / size[1])
+    camera = view.camera(size[0])
     before, after = (render(scene, camera).color[0].clamp(0, 1) for scene in (source.pasted, source.scene))
     return before, after
+
+
+def divided(before: torch.Tensor, after: torch.Tensor, column: int | None = None) -> torch.Tensor:
+    """The first left of a column, the middle where none is given, the second right of it."""
+    at = before.shape[1] // 2 if column is None else column
+    return torch.cat([before[:, :at], after[:, at:]], 1)
 
 
 def test_a_story_of_the_page(browser, project, page_file):
@@ -101,13 +124,13 @@ def test_a_story_of_the_page(browser, project, page_file):
     before, after = ours(project)
     assert psnr(before, after) < 28  # what is compared differs
     page = Page(browser, page_file)
-    first = page.picture()
-    assert psnr(first, after) > CLOSE_DB
+    assert page.page.locator("#still").count() == 0
     page.page.get_by_role("button", name="Before").click(force=True)
     assert psnr(page.picture(), before) > CLOSE_DB
     assert page.page.get_by_role("button", name="Before").get_attribute("aria-pressed") == "true"
     page.page.keyboard.press("b")
-    assert psnr(page.picture(), after) > CLOSE_DB
+    first = page.picture()
+    assert psnr(first, after) > CLOSE_DB
 
     page.page.mouse.move(240, 180)
     page.page.mouse.down()
@@ -133,7 +156,40 @@ def test_a_story_of_the_page(browser, project, page_file):
     assert "Failed to fetch" in refused
     assert any("Content Security Policy" in error for error in page.errors)
     page.context.close()
-    assert re.findall(r"(?:src|href)=\"([^\"]+)\"", page_file.read_text()) == []
+    assert re.findall(r"(?:src|href)=\"(?!data:)([^\"]+)\"", page_file.read_text()) == []
+
+
+def test_the_divider_and_the_full_screen(browser, project, page_file):
+    page = Page(browser, page_file)
+    divider, before = page.page.get_by_role("slider"), page.page.get_by_role("button", name="Before")
+    assert psnr(page.picture(), divided(*ours(project))) > CLOSE_DB
+    assert before.get_attribute("aria-pressed") == "false"
+    page.page.keyboard.press("ArrowLeft")  # both scenes turn
+    page.page.get_by_role("button", name="After").click(force=True)
+    after = page.picture()
+    assert divider.get_attribute("aria-valuenow") == "0"
+    handle = divider.locator("svg").bounding_box()  # half of it is in the page
+    page.page.mouse.move(handle["x"] + 30, handle["y"] + 22)
+    page.page.mouse.down()
+    page.page.mouse.move(264, 100, steps=4)
+    page.page.mouse.up()
+    assert divider.get_attribute("aria-valuenow") == "55"
+    dragged = page.picture()
+    divider.press("End")
+    assert before.get_attribute("aria-pressed") == "true"
+    assert psnr(dragged, divided(page.picture(), after, 264)) > 45
+    assert psnr(dragged, after) < 35
+    divider.press("ArrowLeft")
+    assert divider.get_attribute("aria-valuenow") == "95"
+
+    whole = page.page.get_by_role("button", name="Full screen")
+    whole.click(force=True)
+    page.page.wait_for_function("document.fullscreenElement !== null")
+    page.page.wait_for_selector("#whole[aria-pressed=true]")
+    whole.click(force=True)
+    page.page.wait_for_function("document.fullscreenElement === null")
+    assert page.errors == []
+    page.context.close()
 
 
 @pytest.mark.long
@@ -164,14 +220,52 @@ def test_fingers_turn_and_pinch(browser, page_file):
     page.context.close()
 
 
-def test_without_webgl_the_page_says_so(browser, page_file):
-    page = browser.new_context(offline=True).new_page()
+@pytest.mark.parametrize("size", [SIZE, (640, 300), (200, 400)])
+def test_without_webgl_a_still_of_the_first_view_is_shown(browser, project, page_file, size):
+    """As before the engine has started, in pages of any shape; and the page says why."""
+    context = browser.new_context(offline=True, viewport={"width": size[0], "height": size[1]})
+    page = context.new_page()
     page.set_default_timeout(1000 * HANG_LIMIT)
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
     page.goto(page_file.as_uri())
     page.wait_for_selector("body[data-state=failed]")
     assert page.inner_text("#message") == "This browser cannot draw the scene: it has no WebGL 2."
+    page.add_style_tag(content=HIDDEN)
+    # 44 dB were measured: the still is a compressed picture of our renderer's
+    assert psnr(screenshot(page), divided(*ours(project, size))) > CLOSE_DB
+    context.close()
+
+
+def test_a_narrow_page_shows_the_width_of_the_first_view(browser, project, page_file):
+    size = (200, 400)
+    page = Page(browser, page_file, size)
+    assert psnr(page.picture(), divided(*ours(project, size))) > CLOSE_DB
     page.context.close()
+
+
+def test_a_shadow_of_many_faint_gaussians_has_the_hue_of_others(browser, tmp_path):
+    """`relight` splits the Gaussians under a shadow: blended in 8 bits, each was rounded, and they turned magenta.
+
+    One strip of a plane is in a shadow that was photographed, the other in one of pieces, of median opacity 0.013.
+    """
+    surface = plane((0.75, 0.55, 0.4))
+    even = (torch.tensor([0.75, 0.55, 0.4]) - 0.5) / 0.28209479
+    surface = replace(surface, sh=even.expand_as(surface.sh), opacity_logits=torch.zeros(surface.count))
+    surface = concatenate([surface.select(surface.means[:, 1].abs() < 0.6)] * 4)
+    x, dark = surface.means[:, 0], darkened(surface, 0.5)
+    pieces = dark.select(x > 0.3)
+    for axis in (0, 1, 0):
+        pieces, _ = split_along(pieces, torch.full((pieces.count,), axis))
+    scene = concatenate([surface.select(x.abs() < 0.3), dark.select(x < -0.3), pieces])
+    view = FirstView((0.0, -0.3, 2.2), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0), 50.0, SIZE[0] / SIZE[1])
+    write_viewer_page(tmp_path / "a.html", {"Plane": scene}, view, title="Plane")
+    page = Page(browser, tmp_path / "a.html", (240, 180))
+    lab = cv2.cvtColor(page.picture().numpy(), cv2.COLOR_RGB2LAB)[70:110]
+    page.context.close()
+    own, lit, inserted = (lab[:, left : left + 30].mean((0, 1)) for left in (60, 105, 150))
+    assert own[0] < 0.75 * lit[0]  # shadows
+    # our renderer has them 0.1 apart, as pieces are not quite their whole; 3.1 in 8 bits
+    assert np.abs(inserted - own)[1:].max() < 0.5
 
 
 def test_one_scene_has_no_buttons_and_its_title_is_text_and_nothing_else(browser, project, tmp_path):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from format_files import GOLDEN, TOOLS, equal, parts_of_glb, random_gaussians
+from format_files import GOLDEN, TOOLS, equal, glb, parts_of_glb, random_gaussians
 from test_scenes_of_other_tools import BYTE, COMPRESSED, EXACT, GLB, SH_BYTE, SOG, SPLAT, SPZ, assert_within
 
 from splatgraft import formats
@@ -96,7 +96,7 @@ def test_opaque_and_clear_stay_finite(tmp_path):
         assert back.sigmoid()[1] > 1 - 0.5 / 255
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog"])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog", ".glb"])
 def test_up_and_size_are_read_back(tmp_path, suffix):
     metadata = formats.SceneMetadata(up=(0.0, -0.6, 0.8), metres_per_unit=0.21)
     formats.write_gaussians(tmp_path / f"a{suffix}", random_gaussians(20), metadata=metadata)
@@ -170,6 +170,14 @@ def test_the_glb_is_what_the_specification_asks_for(original, tmp_path):
     rotation = values("KHR_gaussian_splatting:ROTATION")
     assert np.allclose(np.linalg.norm(rotation, axis=1), 1, atol=1e-5)
     assert json.dumps(content["asset"]) == '{"version": "2.0", "generator": "splatgraft"}'
+    # up is stated in the axes of the positions
+    formats.write_gaussians(tmp_path / "a.glb", original, metadata=formats.SceneMetadata(up=(0.48, -0.6, 0.64)))
+    content, _ = parts_of_glb((tmp_path / "a.glb").read_bytes())
+    assert content["asset"]["extras"] == {"up": pytest.approx([-0.48, 0.6, 0.64])}
+    # another program's extras may mean anything
+    content["asset"] = {"version": "2.0", "generator": "other", "extras": {"up": "Y"}}
+    (tmp_path / "b.glb").write_bytes(glb(content, binary))
+    assert formats.read_scene(tmp_path / "b.glb").metadata.up is None
 
 
 def test_meta_json_of_sog_and_the_same_bytes_twice(tmp_path):

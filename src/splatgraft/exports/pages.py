@@ -1,25 +1,32 @@
 """HTML files that load nothing from anywhere: scenes with a viewer for them, and the report of `evaluate`.
 
-The scenes are SOG, the viewer is `viewer/viewer.js` on the PlayCanvas engine (MIT; its licence is part of the page). A
-content security policy in the page forbids every request. Pictures of a report are made smaller and put into the page.
+The scenes are SOG, the viewer is `viewer/viewer.js` on the PlayCanvas engine (MIT; its licence is part of the page).
+Until the engine has drawn, a still of the opening view is shown. A content security policy in the page forbids every
+request. Pictures of a report are made smaller and put into the page.
 """
 
 import base64
 import gzip
 import io
 import json
+import math
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from html import escape
 from importlib.resources import files
 from pathlib import Path
 
+import torch
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.exports.export_source import FirstView
 from splatgraft.formats.scenes.scene_file import SceneMetadata
 from splatgraft.formats.scenes.sog import encode_sog
+from splatgraft.rendering import render
 from splatgraft.runtime.files import atomic_write
 
 _POLICY = (
@@ -33,6 +40,16 @@ _THUMBNAIL_PX = 240
 _DATA = re.compile(r'(<script type="application/json" id="views">)(.*?)(</script>)', re.DOTALL)
 _LOCAL = re.compile(r'(<(?:img|a)\b[^>]*?\b(?:src|href)=")([^":#]+)(")')
 _NOTE = "The page needs only the files in its folder; it loads nothing from the network."
+_SPLIT = 0.5
+"""Where the divider between two scenes stands at first, share of the width."""
+_WIDEST = 2.0
+"""A page narrower than the first view shows the same width, up to this factor of the tangent of its vertical field of
+view."""
+_STILL_ASPECT = 1.2
+"""Width over height of the still, whose height is that of the narrowest page: it covers pages of up to 2.4."""
+_STILL_PX = 1600
+"""Width of the still: 1280 pixels of a page 1.6 wide are 1067 of it."""
+_STILL_QUALITY = 60
 _NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 """An empty picture, until the page's script sets the pictures of a view."""
 
@@ -40,7 +57,7 @@ _NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTA
 def write_viewer_page(
     path: Path, scenes: Mapping[str, Gaussians], view: FirstView, *, title: str, background: float = 0.0
 ) -> None:
-    """Write a page of finite scenes by the label of their button; the last one is shown first, a single one has none.
+    """Write a page of one finite scene, or of two by their labels, which a divider compares: the first is left of it.
 
     `background` is the grey behind the scene, sRGB.
     """
@@ -49,12 +66,13 @@ def write_viewer_page(
     distance = sum((a - b) ** 2 for a, b in zip(view.eye, view.center, strict=True)) ** 0.5
     told = {
         "scenes": list(scenes),
-        "first": len(scenes) - 1,
+        "split": _SPLIT if len(scenes) > 1 else 0,
         "eye": view.eye,
         "center": view.center,
         "up": view.up,
         "fov_deg": view.fov_deg,
         "aspect": view.aspect,
+        "widest": _WIDEST,
         "near": 0.01 * distance,
         "far": 100 * distance,
         "background": [background] * 3,
@@ -70,15 +88,39 @@ def write_viewer_page(
         title=escape(title),
         licence=(here / "playcanvas.LICENSE.txt").read_text(encoding="utf-8").strip(),
         style=(here / "viewer.css").read_text(encoding="utf-8"),
+        still=_base64(_still(list(scenes.values()), view, background)),
+        still_width=f"{100 * _WIDEST / view.aspect:.2f}vw",
+        split=round(100 * _SPLIT),
+        hidden="" if len(scenes) > 1 else " hidden",
+        still_tallest=f"{100 * _WIDEST:g}%",
         view=json.dumps(told).replace("<", "\\u003c"),
         engine=_base64(gzip.compress(engine, 9, mtime=0)),
         data=data,
         reset=_icon("M4 4v6h6 M5 10a8 8 0 1 1-.6 5"),
+        divider=_icon("M9 6l-6 6 6 6 M15 6l6 6-6 6"),
         whole=_icon("M4 9V4h5 M15 4h5v5 M20 15v5h-5 M9 20H4v-5"),
         viewer=(here / "viewer.js").read_text(encoding="utf-8"),
     )
     with atomic_write(path) as stream:
         stream.write(text.encode())
+
+
+def _still(scenes: list[Gaussians], view: FirstView, background: float) -> bytes:
+    """The opening view as WebP, with margins for pages of other shapes; two scenes side by side of the divider."""
+    tangent = _WIDEST * math.tan(math.radians(view.fov_deg) / 2)
+    wider = replace(view, fov_deg=2 * math.degrees(math.atan(tangent)), aspect=_STILL_ASPECT)
+    camera = wider.camera(_STILL_PX)
+    pictures: list[Float[Tensor, "h w 3"]] = []
+    for scene in scenes:
+        drawn = render(scene, camera)
+        pictures.append(drawn.color[0] + background * (1 - drawn.alpha[0])[..., None])
+    if len(pictures) > 1:
+        at = round(_SPLIT * _STILL_PX)
+        pictures = [torch.cat([pictures[0][:, :at], pictures[1][:, at:]], 1)]
+    pixels = (pictures[0].detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "WEBP", quality=_STILL_QUALITY, method=4)
+    return stream.getvalue()
 
 
 def write_report_file(path: Path, report: Path) -> None:
@@ -154,10 +196,14 @@ _PAGE = """<!doctype html>
 <body data-state="loading">
 <canvas id="canvas" tabindex="0" role="img" aria-busy="true" aria-label="{title}. Drag or use the arrow keys to turn,
 plus and minus to come nearer, Home to go back."></canvas>
+<div id="still"><img alt="" decoding="sync" style="height: clamp(100%, {still_width}, {still_tallest})"
+src="data:image/webp;base64,{still}"></div>
+<div id="divider" role="slider" tabindex="0" aria-label="Share of the picture before the change" aria-valuemin="0"
+aria-valuemax="100" aria-valuenow="{split}" style="left: {split}%"{hidden}>{divider}</div>
 <h1>{title}</h1>
 <div class="corner" role="group" aria-label="View">
 <button type="button" id="reset" aria-label="Back to the first view" title="Back to the first view">{reset}</button>
-<button type="button" id="whole" aria-label="Whole screen" title="Whole screen">{whole}</button>
+<button type="button" id="whole" aria-label="Full screen" title="Full screen">{whole}</button>
 </div>
 <div class="bar" id="scenes" role="group" aria-label="Compare"></div>
 <div id="message" role="status"></div>

@@ -14,6 +14,11 @@
   };
   const fail = (text) => { say(text); document.body.dataset.state = "failed"; };
 
+  // the still stands on the screen before the engine takes the processor; a page in the background has no frames
+  await new Promise((done) => {
+    get("still").firstElementChild.decode().finally(() => requestAnimationFrame(() => setTimeout(done))).catch(() => {});
+    setTimeout(done, 500);
+  });
   if (!window.DecompressionStream) return fail("This browser is too old to show the scene.");
   const unpacked = new Blob([bytes("engine")]).stream().pipeThrough(new DecompressionStream("gzip"));
   const script = document.createElement("script");
@@ -46,12 +51,32 @@
   const root = new pc.Entity("scene");
   root.setLocalRotation(turn);
   app.root.addChild(root);
-  const camera = new pc.Entity("camera");
-  camera.addComponent("camera", {
-    clearColor: new pc.Color(view.background[0], view.background[1], view.background[2]),
-    fov: view.fov_deg, nearClip: view.near, farClip: view.far,
+
+  // Scenes have many faint Gaussians in a row. Blended in the 8 bits of a canvas, each is rounded by channel, which tints
+  // what they make up together; they are blended in 16-bit floats and copied.
+  let target = null;
+  if (device.textureHalfFloatRenderable) {
+    const colors = new pc.Texture(device, { width: 4, height: 4, format: pc.PIXELFORMAT_RGBA16F, mipmaps: false });
+    target = new pc.RenderTarget({ colorBuffer: colors, depth: false });
+    app.on("postrender", () => {
+      device.setScissor(0, 0, device.width, device.height); // a copy is clipped as well
+      device.copyRenderTarget(target, null, true, false);
+    });
+  }
+
+  // each scene has a layer and a camera, which draws the scene's side of the divider
+  const cameras = view.scenes.map((label, index) => {
+    const layer = new pc.Layer({ name: label });
+    app.scene.layers.push(layer);
+    const entity = new pc.Entity("camera");
+    entity.addComponent("camera", {
+      clearColor: new pc.Color(view.background[0], view.background[1], view.background[2]),
+      nearClip: view.near, farClip: view.far, layers: [layer.id], priority: index, renderTarget: target,
+    });
+    entity.camera.camera._scissorRectClear = true; // else the engine takes the whole rectangle of the camera
+    app.root.addChild(entity);
+    return { entity, layer, sorted: 0 };
   });
-  app.root.addChild(camera);
 
   // --- the orbit: angles in degrees, goal and where the camera is on its way there
   const start = (() => {
@@ -72,8 +97,10 @@
   const place = () => {
     const a = now.azimuth * Math.PI / 180, e = now.elevation * Math.PI / 180, d = now.distance;
     const center = new pc.Vec3(now.x, now.y, now.z);
-    camera.setPosition(now.x + d * Math.cos(e) * Math.sin(a), now.y + d * Math.sin(e), now.z + d * Math.cos(e) * Math.cos(a));
-    camera.lookAt(center);
+    for (const { entity } of cameras) {
+      entity.setPosition(now.x + d * Math.cos(e) * Math.sin(a), now.y + d * Math.sin(e), now.z + d * Math.cos(e) * Math.cos(a));
+      entity.lookAt(center);
+    }
   };
   const limit = () => {
     goal.elevation = Math.min(89, Math.max(-89, goal.elevation));
@@ -83,6 +110,7 @@
   const rotate = (dx, dy) => { goal.azimuth -= dx * 0.3; goal.elevation += dy * 0.3; limit(); };
   const zoom = (factor) => { goal.distance *= factor; limit(); };
   const pan = (dx, dy) => {
+    const camera = cameras[0].entity;
     const unit = 2 * now.distance * Math.tan(camera.camera.fov * Math.PI / 360) / canvas.clientHeight;
     const move = camera.right.clone().mulScalar(-dx * unit).add(camera.up.clone().mulScalar(dy * unit));
     goal.x += move.x; goal.y += move.y; goal.z += move.z;
@@ -126,11 +154,11 @@
   canvas.addEventListener("dblclick", reset);
   const buttons = [];
   window.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || event.defaultPrevented) return;
     const does = {
       ArrowLeft: () => rotate(-20, 0), ArrowRight: () => rotate(20, 0), ArrowUp: () => rotate(0, 20),
       ArrowDown: () => rotate(0, -20), "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
-      Home: reset, b: () => entities.length === view.scenes.length && show((shown + 1) % entities.length),
+      Home: reset, b: () => buttons.length && show(split === 0 ? 0 : 1),
     }[event.key];
     if (does) { event.preventDefault(); does(); }
   });
@@ -141,17 +169,35 @@
     if (document.fullscreenElement) document.exitFullscreen();
     else document.documentElement.requestFullscreen();
   });
+  document.addEventListener("fullscreenchange", () =>
+    whole.setAttribute("aria-pressed", String(document.fullscreenElement !== null)));
 
-  // --- the scenes
-  const entities = [];
-  let shown = 0;
-  const show = (index) => {
-    shown = index;
-    entities.forEach((entity, i) => { entity.enabled = i === index; });
-    buttons.forEach((button, i) => button.setAttribute("aria-pressed", String(i === index)));
-    document.body.dataset.shown = view.scenes[index];
-    wake(30);
+  // --- two scenes: the first is left of the divider, at this share of the width
+  let split = view.split;
+  const divider = get("divider");
+  const divide = (share) => {
+    split = Math.min(1, Math.max(0, share));
+    divider.style.left = 100 * split + "%";
+    divider.setAttribute("aria-valuenow", String(Math.round(100 * split)));
+    buttons.forEach((button, index) => button.setAttribute("aria-pressed", String(split === 1 - index)));
+    // half a pixel more, as the engine rounds down
+    const at = (Math.round(split * device.width) + 0.5) / device.width;
+    if (cameras.length > 1) {
+      cameras[0].entity.camera.scissorRect = new pc.Vec4(0, 0, at, 1);
+      cameras[1].entity.camera.scissorRect = new pc.Vec4(at, 0, 1, 1);
+    }
+    wake(2);
   };
+  const show = (index) => divide(1 - index);
+  divider.addEventListener("pointerdown", (event) => divider.setPointerCapture(event.pointerId));
+  divider.addEventListener("pointermove", (event) => {
+    if (divider.hasPointerCapture(event.pointerId)) divide(event.clientX / canvas.clientWidth);
+  });
+  divider.addEventListener("keydown", (event) => {
+    const share = { ArrowLeft: split - 0.05, ArrowRight: split + 0.05, Home: 0, End: 1 }[event.key];
+    if (share !== undefined) { event.preventDefault(); divide(share); }
+  });
+
   const load = (id) => new Promise((resolve, reject) => {
     const contents = bytes(id).buffer;
     const asset = new pc.Asset(id, "gsplat", { url: id + ".sog", filename: id + ".sog", contents });
@@ -165,10 +211,13 @@
     // more pixels than twice the page's are not seen, and cost time
     const ratio = Math.min(2, window.devicePixelRatio || 1);
     device.resizeCanvas(Math.round(canvas.clientWidth * ratio), Math.round(canvas.clientHeight * ratio));
+    if (target) target.resize(device.width, device.height);
     // `fov_deg` is the vertical one of a picture `view.aspect` wide; a narrower page shows the same width
     const tangent = Math.tan(view.fov_deg * Math.PI / 360);
     const narrower = Math.max(1, view.aspect * canvas.clientHeight / canvas.clientWidth);
-    camera.camera.fov = 2 * Math.atan(tangent * Math.min(narrower, 2)) * 180 / Math.PI;
+    const fov = 2 * Math.atan(tangent * Math.min(narrower, view.widest)) * 180 / Math.PI;
+    for (const { entity } of cameras) entity.camera.fov = fov;
+    divide(split);
     wake();
   };
   new ResizeObserver(resize).observe(canvas);
@@ -177,7 +226,8 @@
   place();
   // for a few frames after each move the order of the Gaussians is still the one before
   app.on("update", (dt) => {
-    const step = 1 - Math.exp(-Math.min(dt, 0.1) * 14);
+    const slow = dt >= 0.1; // as without a GPU: no frames between here and there
+    const step = slow ? 1 : 1 - Math.exp(-dt * 14);
     let moving = false;
     for (const key of keys) {
       const way = goal[key] - now[key];
@@ -186,38 +236,42 @@
     }
     place();
     if (moving) frames = Math.max(frames, 20);
-    if (frames > 0) { frames -= 1; app.renderNextFrame = true; } else document.body.dataset.still = "true";
+    if (frames > 0) { frames -= slow ? 4 : 1; app.renderNextFrame = true; } else document.body.dataset.still = "true";
   });
-  let sorted = 0;
-  app.systems.gsplat.on("frame:ready", (_camera, _layer, ready, loading) => {
+  let loaded = false;
+  app.systems.gsplat.on("frame:ready", (camera, _layer, ready, loading) => {
     if (!ready || loading) return wake(2);
-    if (entities.length === view.scenes.length && ++sorted === 2) {
-      document.body.dataset.state = "ready";
-      canvas.setAttribute("aria-busy", "false");
-    }
+    const drawing = cameras.find(({ entity }) => entity.camera === camera);
+    if (!loaded || !drawing) return;
+    drawing.sorted += 1;
+    if (document.body.dataset.state !== "loading" || cameras.some(({ sorted }) => sorted < 2)) return;
+    get("still").remove();
+    document.body.dataset.state = "ready";
+    canvas.setAttribute("aria-busy", "false");
   });
 
   try {
     for (const [index, label] of view.scenes.entries()) {
       say(`Loading ${index + 1} of ${view.scenes.length} \u2026`);
       const entity = new pc.Entity(label);
-      entity.addComponent("gsplat", { asset: await load("scene" + index) });
-      entities.push(entity);
+      entity.addComponent("gsplat", { asset: await load("scene" + index), layers: [cameras[index].layer.id] });
       root.addChild(entity);
-      entity.enabled = index === view.first;
-      if (view.scenes.length > 1) {
-        const button = document.createElement("button");
-        button.type = "button";
-        button.textContent = label;
-        button.addEventListener("click", () => show(index));
-        buttons.push(button);
-        get("scenes").append(button);
-      }
-      wake();
     }
   } catch (error) {
     return fail(`The scene could not be shown: ${error}`);
   }
+  if (view.scenes.length > 1) {
+    for (const [index, label] of view.scenes.entries()) {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.textContent = label;
+      button.addEventListener("click", () => show(index));
+      buttons.push(button);
+      get("scenes").append(button);
+    }
+  }
+  loaded = true;
   say("");
-  show(view.first);
+  divide(split);
+  wake(30);
 })();

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.formats.scenes.scene_file import SceneFile
+from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
 
 _DIRECTIONS = {"L": (-1, 0, 0), "R": (1, 0, 0), "U": (0, -1, 0), "D": (0, 1, 0), "B": (0, 0, -1), "F": (0, 0, 1)}
 """In the axes RDF."""
@@ -41,6 +41,14 @@ def change_axes(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians
     )
 
 
+def turn_up(metadata: SceneMetadata, matrix: Float[Tensor, "3 3"]) -> SceneMetadata:
+    """The metadata of a scene in other axes; `matrix` as for `change_axes`."""
+    if metadata.up is None:
+        return metadata
+    x, y, z = (matrix @ torch.tensor(metadata.up)).tolist()
+    return replace(metadata, up=(x, y, z))
+
+
 def with_axes(scene: SceneFile, axes: str) -> SceneFile:
     """The scene, with the file's axes taken to be `axes` instead of those that were found."""
     name = axes.upper()
@@ -48,8 +56,6 @@ def with_axes(scene: SceneFile, axes: str) -> SceneFile:
         raise ValueError(f"axes: expected directions of x, y and z such as RDF, RUB or LUF, found {axes[:20]!r}")
     if name == scene.axes:
         return scene
-    matrix, metadata = rdf_from(name) @ rdf_from(scene.axes).T, scene.metadata
-    if metadata.up is not None:
-        x, y, z = (matrix @ torch.tensor(metadata.up)).tolist()
-        metadata = replace(metadata, up=(x, y, z))
-    return replace(scene, gaussians=change_axes(scene.gaussians, matrix), axes=name, metadata=metadata)
+    matrix = rdf_from(name) @ rdf_from(scene.axes).T
+    gaussians, metadata = change_axes(scene.gaussians, matrix), turn_up(scene.metadata, matrix)
+    return replace(scene, gaussians=gaussians, axes=name, metadata=metadata)

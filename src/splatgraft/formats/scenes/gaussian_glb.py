@@ -2,7 +2,8 @@
 
 Attributes of a POINTS primitive: ROTATION (xyzw), SCALE (linear), OPACITY (linear), SH_DEGREE_l_COEF_n; float32 where
 written, also normalised integers where read. Transforms of nodes are applied. glTF's unit is the metre and its axes are
-left-up-front; they are turned to and from those of a .ply, and a scene is as upright and as large as it is given.
+left-up-front; they are turned to and from those of a .ply, and a scene is as upright and as large as it is given. The
+asset's extras say which way is up in the file's own axes, and how large a unit is.
 """
 
 import json
@@ -19,13 +20,15 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
-from splatgraft.formats.scenes.axes import change_axes, rdf_from
+from splatgraft.formats.scenes.axes import change_axes, rdf_from, turn_up
 from splatgraft.formats.scenes.quantization import SMALLEST_SCALE, bytes_from_unit, writable
-from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
+from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata, stated_metadata
 from splatgraft.runtime.files import atomic_write
 
 AXES = "LUF"
 """Left, up, front."""
+_GENERATOR = "splatgraft"
+"""Whose extras are understood: those of other programs may mean anything."""
 _SPLATTING = "KHR_gaussian_splatting"
 """The extension's name, which stands before those of its attributes as well."""
 _MAGIC, _VERSION, _JSON, _BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
@@ -55,7 +58,14 @@ def read_gaussian_glb(path: Path) -> SceneFile:
                 parts.append(_placed(path, part, matrix))
     if not parts:
         raise ValueError(f"{path}: expected Gaussians ({_SPLATTING}), found a .glb without")
-    return SceneFile(change_axes(concatenate(parts), rdf_from(AXES)), AXES, notes=tuple(notes))
+    gaussians = change_axes(concatenate(parts), rdf_from(AXES))
+    return SceneFile(gaussians, AXES, metadata=_metadata(content["asset"]), notes=tuple(notes))
+
+
+def _metadata(asset: dict[str, Any]) -> SceneMetadata:
+    """What our own writer stated, in the axes of a .ply."""
+    extras = asset.get("extras", {}) if asset.get("generator") == _GENERATOR else {}
+    return turn_up(stated_metadata(extras.get("up"), extras.get("metres_per_unit")), rdf_from(AXES))
 
 
 def _parts(path: Path) -> tuple[dict[str, Any], bytes]:
@@ -187,9 +197,10 @@ def write_gaussian_glb(path: Path, gaussians: Gaussians, metadata: SceneMetadata
         "mode": _POINTS,
         "extensions": {_SPLATTING: splats | {"sortingMethod": "cameraDistance"}},
     }
-    extras = {"extras": metadata.known} if metadata.known else {}
+    known = turn_up(metadata, rdf_from(AXES).T).known
+    extras = {"extras": known} if known else {}
     content: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "splatgraft"} | extras,
+        "asset": {"version": "2.0", "generator": _GENERATOR} | extras,
         "extensionsUsed": [_SPLATTING],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
