@@ -186,6 +186,8 @@ def import_splats(path, part):
         _show_as_points(thing)
         said = "coloured points, as neither Blender 5.3 nor the add-on KIRI 3DGS Render is here"
     thing.name, thing["splatgraft"] = f"splatgraft {part}", part
+    # meshes get their light from map and lamps alone, which what the splats show would block or add to
+    thing.visible_shadow = thing.visible_diffuse = thing.visible_glossy = thing.visible_transmission = False
     return thing, said
 
 

@@ -55,6 +55,7 @@ def main(addon_file, command, source, target, folder, out):
     found["lamps"] = [described(lamp) for lamp in lamps]
     found["world"] = render_world()
     found["level"] = [render_level(addon, root, away) for away in (None, 3.0)]
+    found["blocks"] = addon.find("relit").visible_shadow or addon.find("relit").visible_diffuse
     found["colors"] = len(addon.find("relit").data.color_attributes)
     # a failed command's line is shown
     Path(folder, "light.json").rename(Path(folder, "lamps.json"))

@@ -85,6 +85,7 @@ def test_the_object_lies_in_the_relit_scene_where_its_box_is(used):
     assert found["status"].startswith("coloured points")
     assert found["hidden"] == [True, True]
     assert found["colors"] == 1
+    assert not found["blocks"]
 
 
 def test_the_sun_lamp_shines_from_the_sun_with_its_irradiance(used):
