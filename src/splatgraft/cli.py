@@ -33,6 +33,7 @@ _TABLE = (
     ("harmonize photo", "harmonize_photo", "the same for one picture and its mask, without any scene"),
     ("consolidate", "steps.consolidate", "fit the colours of the scene to the harmonised views"),
     ("evaluate", "steps.evaluate", "compare, picture and report"),
+    ("light", "light", "write the light at a place as an environment map and lamps, for other programs"),
     ("export", "export", "write a scene or a result as a page, for another program, or as pictures"),
     ("doctor", "doctor", "say what is installed, what is missing and how to get it"),
 )

@@ -292,6 +292,19 @@ def write_image(path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, 
         Image.fromarray(array).save(stream, format=kind, **({"quality": 95} if kind == "JPEG" else {}))
 
 
+def write_radiance(path: Path, radiance: Float[Tensor, "h w 3"]) -> None:
+    """Write linear rgb as a Radiance .hdr, rounded to 8 bits of each pixel's largest channel.
+
+    Args:
+        path: A file that ends in .hdr; it appears whole or not at all.
+        radiance: Linear rgb, at least 0.
+    """
+    encoded, data = cv2.imencode(".hdr", np.ascontiguousarray(radiance.flip(-1).numpy()))
+    assert encoded
+    with atomic_write(path) as stream:
+        stream.write(data.tobytes())
+
+
 def resize(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "j i *c"]:
     """Resampled by area where it shrinks, bilinearly where it grows."""
     if (image.shape[1], image.shape[0]) == (width, height):

@@ -95,7 +95,7 @@ class SceneLight:
         Returns:
             None where the objects are too far from the maps' middle, or need larger or much smaller maps.
         """
-        place, region = _place(spheres), self.maps.region
+        place, region = place_of(spheres), self.maps.region
         least, most = (factor * place.radius * self.reach for factor in _KEPT_RADII)
         shift = float((region.center - place.center).norm())
         if not least <= region.radius <= most or shift >= _KEPT_SHIFT * region.radius:
@@ -135,7 +135,7 @@ def find_scene_light(
         reach: Object radii to which shadows are computed.
         sun_through: Points and their shadows, as for `light.sun.set_sun`: an estimate has this sun.
     """
-    place = _place(spheres)
+    place = place_of(spheres)
     estimate = None
     if light is None:
         found = estimate_light(scene, place, cameras, sun_through=sun_through)
@@ -150,7 +150,7 @@ def find_scene_light(
     return SceneLight(scene, cameras, light, estimate, samples, maps, receivers, tuple(spheres), reach)
 
 
-def _place(spheres: Sequence[BoundingSphere]) -> BoundingSphere:
+def place_of(spheres: Sequence[BoundingSphere]) -> BoundingSphere:
     """The middle of objects, and the radius of the largest."""
     center = torch.stack([sphere.center for sphere in spheres]).mean(0)
     return BoundingSphere(center, max(sphere.radius for sphere in spheres))

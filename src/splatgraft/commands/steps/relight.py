@@ -75,7 +75,7 @@ class Relight:
             gaussians, is_object = adjusted.bake()
         else:
             cameras, sources = read_cameras(self.cameras), self._sources()
-            relit = relight(composite, cameras, sources=sources, light=self._given(), options=self.options)
+            relit = relight(composite, cameras, sources=sources, light=self.given(), options=self.options)
             found = relit.light
             gaussians, is_object = relit.bake(self.weights)
             notes = (*relit.report, *self._level(relit))
@@ -99,7 +99,8 @@ class Relight:
             return (Note(f"The photos' exposure was not compared with the light: {error}.", "warning"),)
         return () if target is None or source is None else describe_level(relit, target=target, source=source)
 
-    def _given(self) -> Light | None:
+    def given(self) -> Light | None:
+        """The light that replaces the estimate; None where none is named."""
         if self.given_light is None:
             return None
         if not self.given_light.is_file():

@@ -106,6 +106,10 @@ class EstimatedLight:
         """The estimate, with the sun that shadows show."""
         return self.mean if self.sun is None else with_sun(self.mean, self.sun)
 
+    def rest(self) -> Float[Tensor, "k 3"]:
+        """Linear rgb radiance from all `DIRECTIONS` without the sources; `mean`'s ambient light is fitted to it."""
+        return _split_peaks(self.hidden.radiance(self.evidence), self.evidence, within=math.inf)[1]
+
     def with_sun(self, sun: Sun, scene: Gaussians) -> "EstimatedLight":
         """With another sun, which nothing blocks that `scene` shows where the view from the place towards it ends."""
         named = replace(sun, name=sun.name or self._name_at(sun.direction))
@@ -122,7 +126,7 @@ class EstimatedLight:
         """At a place in the same region: the same sources, and ambient light with what is near there."""
         if place.radius == self.place.radius and torch.equal(place.center, self.place.center):
             return self
-        scene = _usable(scene)
+        scene = usable_gaussians(scene)
         panorama = panorama_at(scene, place)
         if isinstance(panorama, NoLight):
             return panorama
@@ -150,7 +154,7 @@ def estimate_light(
             part of the surroundings.
         sun_through: Points and their shadows, as for `light.sun.set_sun`: the estimate then has this sun.
     """
-    scene = _usable(scene)
+    scene = usable_gaussians(scene)
     panorama = panorama_at(scene, place)
     if isinstance(panorama, NoLight):
         return panorama
@@ -181,7 +185,7 @@ def region_around(place: BoundingSphere, cameras: Cameras) -> BoundingSphere:
     return BoundingSphere(place.center, max(_MIN_RADII * place.radius, min(distance, _MAX_RADII * place.radius)))
 
 
-def _usable(scene: Gaussians) -> Gaussians:
+def usable_gaussians(scene: Gaussians) -> Gaussians:
     """The Gaussians whose values are finite and no larger than any camera or scene makes them."""
     good = torch.ones(scene.count, dtype=torch.bool)
     for values in (scene.means, scene.log_scales, scene.quaternions, scene.sh.flatten(1)):

@@ -5,6 +5,7 @@ light.json.
 import json
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -33,6 +34,9 @@ _SOURCE_NUMBERS = {
     "distance": (_MIN_DISTANCE, math.inf),
 }
 """Fields of a source that are one number, and its bounds; a light.json leaves out what is infinite."""
+
+_RIGID = 1e-4
+"""Largest entry of R R^T - I of a rotation in a light.json."""
 
 _WEAK, _STRONG = 0.25, 0.6
 """Shares of a source in the light on what faces it, below and above which words say so."""
@@ -140,8 +144,16 @@ def fit_ambient(radiance: Float[Tensor, "3"]) -> Float[Tensor, "9 3"]:
     return out
 
 
-def light_to_json(light: Light) -> str:
-    """The text of a light.json, which can be changed by hand and read with `light_from_json`."""
+def light_to_json(light: Light, *, world_from_capture: Float[Tensor, "3 3"] | None = None) -> str:
+    """The text of a light.json, which can be changed by hand and read with `light_from_json`.
+
+    Args:
+        light: In the axes of a capture.
+        world_from_capture: A rotation into other axes, in which the text has the light, and which it then names.
+    """
+    axes = {}
+    if world_from_capture is not None:
+        light, axes = light.rotated(world_from_capture), {"world_from_capture": world_from_capture.tolist()}
     sources = []
     for source in light.sources:
         record = {"name": source.name}
@@ -150,6 +162,7 @@ def light_to_json(light: Light) -> str:
         sources.append(record | {key: value for key, value in numbers.items() if math.isfinite(value)})
     record = {
         "format": FORMAT,
+        **axes,
         "sources": sources,
         "ambient_sh": [[round(v, 6) for v in row] for row in light.ambient.tolist()],
         "coverage": round(light.coverage, 4),
@@ -166,7 +179,7 @@ def light_from_json(text: str, *, name: str = "light.json") -> Light:
         name: The file's name in error messages.
 
     Returns:
-        The light, directions normalised.
+        The light in the axes of the capture, directions normalised.
 
     Raises:
         ValueError: The text is no JSON, a key is missing or unknown, or a value is out of its range.
@@ -178,7 +191,7 @@ def light_from_json(text: str, *, name: str = "light.json") -> Light:
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         found = record.get("format") if isinstance(record, dict) else type(record).__name__
         raise ValueError(f'{name}: expected "format": "{FORMAT}", found {found!r}')
-    unknown = sorted(set(record) - {"format", "sources", "ambient_sh", "coverage", "unseen_up"})
+    unknown = sorted(set(record) - {"format", "world_from_capture", "sources", "ambient_sh", "coverage", "unseen_up"})
     if unknown:
         raise ValueError(f"{name}: expected sources, ambient_sh, coverage and unseen_up, found {unknown[0]!r}")
     if not isinstance(record.get("sources"), list):
@@ -187,12 +200,23 @@ def light_from_json(text: str, *, name: str = "light.json") -> Light:
     if not isinstance(ambient, list) or len(ambient) != _AMBIENT_COUNT:
         raise ValueError(f"{name}: expected 9 rows of rgb under ambient_sh, found {ambient!r:.60}")
     rows = [_numbers(row, 3, f"{name}: ambient_sh[{i}]", (-1e6, 1e6)) for i, row in enumerate(ambient)]
-    return Light(
+    found = Light(
         sources=tuple(_source(entry, f"{name}: sources[{i}]") for i, entry in enumerate(record["sources"])),
         ambient=torch.tensor(rows),
         coverage=_numbers([record.get("coverage", 1.0)], 1, f"{name}: coverage", (0.0, 1.0))[0],
         unseen_up=_numbers([record.get("unseen_up", 0.0)], 1, f"{name}: unseen_up", (0.0, 1.0))[0],
     )
+    return found.rotated(_capture_from_world(record, name)) if "world_from_capture" in record else found
+
+
+def _capture_from_world(record: dict[str, Any], name: str) -> Float[Tensor, "3 3"]:
+    where, given = f"{name}: world_from_capture", record["world_from_capture"]
+    if not isinstance(given, list) or len(given) != 3:
+        raise ValueError(f"{where}: expected 3 rows of a rotation, found {given!r:.60}")
+    rotation = torch.tensor([_numbers(row, 3, f"{where}[{i}]", (-1.0, 1.0)) for i, row in enumerate(given)])
+    if not float((rotation @ rotation.T - torch.eye(3)).abs().max()) <= _RIGID or float(torch.linalg.det(rotation)) < 0:
+        raise ValueError(f"{where}: expected a rotation that is orthonormal with determinant 1, found {given!r:.60}")
+    return rotation.T
 
 
 def _source(entry: object, where: str) -> LightSource:

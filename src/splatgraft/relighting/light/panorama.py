@@ -46,7 +46,7 @@ _WIDEST = 0.2
 """Standard deviation over distance; wider Gaussians are left out, as splatting's affine approximation smears them."""
 
 # when there is light at a place; set by hand
-_NEAREST = 0.5
+NEAREST = 0.5
 """Object radii within which Gaussians are left out of the panorama."""
 _TEST_SIZE = 24
 """Pixels; width of a face of the depth cube map that tests whether the place is inside something."""
@@ -194,7 +194,7 @@ def panorama_at(scene: Gaussians, place: BoundingSphere) -> Panorama | NoLight:
     blocked = (rendered.alpha > _SURFACE_ALPHA) & (rendered.depth < _BLOCKED_WITHIN * place.radius)
     if float(blocked.float().mean()) > _MAX_BLOCKED:
         return NoLight("The object is inside a wall or another thing: there is no light to be found there.")
-    panorama = render_panorama(scene, place.center, nearest=_NEAREST * place.radius)
+    panorama = render_panorama(scene, place.center, nearest=NEAREST * place.radius)
     if panorama.coverage < _MIN_COVERAGE:
         return NoLight(f"Only {100 * panorama.coverage:.0f}% of the object's surroundings were captured.")
     mean = float((panorama.radiance.mean(-1) * panorama.alpha * panorama.solid_angles).sum()) / (4 * math.pi)
@@ -205,7 +205,7 @@ def panorama_at(scene: Gaussians, place: BoundingSphere) -> Panorama | NoLight:
 
 def place_surroundings(scene: Gaussians, cameras: Cameras, place: BoundingSphere) -> Surroundings:
     """The surroundings of an object's bounding sphere, with what is near it."""
-    return surroundings_at(scene, cameras, place.center, nearest=_NEAREST * place.radius)
+    return surroundings_at(scene, cameras, place.center, nearest=NEAREST * place.radius)
 
 
 def surroundings_at(scene: Gaussians, cameras: Cameras, center: Float[Tensor, "3"], *, nearest: float) -> Surroundings:

@@ -1,0 +1,432 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blender add-on: insert an object from a Gaussian splat capture into another one, lit by its new place.
+
+It only calls the command line (`splatgraft capture`, `adopt`, `relight`, `light`) in the background, and imports what
+that wrote. Everything of the target hangs on one empty, in whose local axes the target's capture is: as that empty is
+moved, turned or scaled, splats and lamps go with it.
+"""
+
+import itertools
+import json
+import math
+import os
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+from bpy.props import PointerProperty, StringProperty
+from mathutils import Matrix, Vector
+
+bl_info = {
+    "name": "Splatgraft: insert an object from a capture",
+    "author": "the splatgraft authors",
+    "version": (0, 1, 0),
+    "blender": (4, 2, 0),
+    "location": "3D Viewport > Sidebar > Splatgraft",
+    "description": "Places an object of one Gaussian splat capture in another and gives it the light there",
+    "category": "Import-Export",
+}
+
+_SH_C0 = 0.28209479177387814
+"""Spherical harmonic of degree 0, which turns f_dc into colour."""
+_NATIVE_SPLATS = (5, 3, 0)
+"""First Blender whose own .ply importer makes Gaussian splats."""
+_STRAY = 1.0
+"""Percent of an object's points on either side that its box may leave out."""
+_RIGID = 1e-3
+"""Largest difference of an axis's scale from the mean, and cosine between axes, that are no shear."""
+_SECONDS = 0.5
+"""Between two looks at the running command."""
+
+
+class Job:
+    """Commands that run one after another in the background; what they say goes to a log whose last line is shown."""
+
+    running: "Job | None" = None
+
+    def __init__(self, commands, log, done):
+        """Start `commands`, lists of words, of which each begins when the one before it succeeded; then `done()`."""
+        self.commands, self.log, self.done, self.process = list(commands), log, done, None
+        log.parent.mkdir(parents=True, exist_ok=True)
+        log.write_text("")
+        Job.running = self
+        bpy.app.timers.register(Job.poll, first_interval=0.0)
+
+    @staticmethod
+    def poll():
+        """What the timer calls: the seconds to the next call, or None at the end."""
+        job, state = Job.running, bpy.context.scene.splatgraft
+        if job is None:
+            return None
+        try:
+            goes_on = job._step(state)
+        except (OSError, RuntimeError, ValueError, LookupError, AttributeError, StopIteration) as error:
+            state.status, goes_on = f"failed: {error}", False
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                area.tag_redraw()
+        if not goes_on:
+            Job.running = None
+        return _SECONDS if goes_on else None
+
+    def _step(self, state):
+        if self.process is not None:
+            code = self.process.poll()
+            said = [line.strip() for line in self.log.read_text(errors="replace").splitlines() if line.strip()]
+            state.status = said[-1] if said else "begins"
+            if code is None:
+                return True
+            if code != 0:
+                raise RuntimeError(state.status.removeprefix("splatgraft: "))
+        if not self.commands:
+            # a timer has no window, which importers ask for
+            with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+                state.status = self.done()
+            return False
+        with self.log.open("a") as log:
+            self.process = subprocess.Popen(self.commands.pop(0), stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        return True
+
+    def stop(self):
+        """End the running command; what it had begun is thrown away, and earlier results stay."""
+        Job.running = None
+        if self.process is not None and self.process.poll() is None:
+            self.process.terminate()
+
+
+class Settings(bpy.types.PropertyGroup):
+    """What the panel asks for, stored in the .blend."""
+
+    command: StringProperty(
+        name="Command", subtype="FILE_PATH", default="splatgraft", description="splatgraft's program"
+    )
+    source: StringProperty(
+        name="Object", subtype="FILE_PATH", description="A splatgraft project whose object it is, or an object's .ply"
+    )
+    target: StringProperty(
+        name="Target", subtype="FILE_PATH", description="A trained scene (.ply, .spz, .glb, ...), or a project's folder"
+    )
+    folder: StringProperty(
+        name="Results", subtype="DIR_PATH", default="//splatgraft", description="A folder of its own"
+    )
+    status: StringProperty(default="")
+
+
+class Paths:
+    """The files that the settings name."""
+
+    def __init__(self, settings):
+        """Find them; a ValueError where one is missing."""
+        self.command = shutil.which(bpy.path.abspath(settings.command)) or shutil.which(settings.command)
+        if self.command is None:
+            raise ValueError(f"Command: expected the program splatgraft, found no {settings.command}")
+        if settings.folder.startswith("//") and not bpy.data.filepath:
+            raise ValueError("Results: expected a folder, or a .blend that was saved, found neither")
+        self.folder = Path(bpy.path.abspath(settings.folder)).resolve()
+        source, target = (Path(bpy.path.abspath(path)) for path in (settings.source, settings.target))
+        self.object = source / "object" / "object.ply" if source.is_dir() else source
+        if not self.object.is_file() or self.object.suffix != ".ply":
+            raise ValueError(f"Object: expected a project with object/object.ply, or a .ply, found {settings.source!r}")
+        self.surroundings = self.object.with_name("surroundings.ply")
+        self.object_cameras = self.object.parent.parent / "source" / "capture" / "transforms.json"
+        self.knows_source = self.surroundings.is_file() and self.object_cameras.is_file()
+        self.given_target = target / "target" / "scene" / "scene.ply" if target.is_dir() else target
+        if not self.given_target.is_file():
+            raise ValueError(f"Target: expected a scene or a project with target/scene, found {settings.target!r}")
+        self.target, self.cameras = self.given_target, target.parent.parent / "capture" / "transforms.json"
+        if target.is_dir():
+            self.cameras = target / "target" / "capture" / "transforms.json"
+        self.is_trained_elsewhere = not self.cameras.is_file()
+        if self.is_trained_elsewhere:
+            self.target = self.folder / "target" / "scene" / "scene.ply"
+            self.cameras = self.folder / "target" / "capture" / "transforms.json"
+        self.placement, self.relit = self.folder / "placement.json", self.folder / "relit" / "scene.ply"
+        self.map, self.lamps = self.folder / "light.hdr", self.folder / "light.json"
+
+    def preparing(self):
+        """The commands that give a scene without a capture its cameras, and a .ply in their axes."""
+        given, made = str(self.given_target), self.target.parent
+        if not self.is_trained_elsewhere:
+            return []
+        return [
+            [self.command, "capture", given, "--out", str(self.cameras.parent)],
+            [self.command, "adopt", given, "--capture", str(self.cameras.parent), "--out", str(made)],
+        ]
+
+    def relighting(self):
+        """The commands that give the object its new light, and write that light."""
+        common = ["--placement", str(self.placement), "--cameras", str(self.cameras)]
+        relight = [self.command, "relight", "--target", str(self.target), *common, "--out", str(self.relit.parent)]
+        if self.knows_source:
+            relight += ["--surroundings", str(self.surroundings), "--object-cameras", str(self.object_cameras)]
+        light = [self.command, "light", str(self.target), *common, "--out", str(self.map), "--frame", "capture"]
+        return [relight, light]
+
+
+def find(part):
+    """The object that has this part in the scene: root, target, object, box, relit; None where there is none."""
+    return next((thing for thing in bpy.context.scene.objects if thing.get("splatgraft") == part), None)
+
+
+def import_splats(path, part):
+    """Import a Gaussian .ply as `part`, in its own axes, by the best that is installed; gives it and what it is."""
+    before = set(bpy.data.objects)
+    kiri = next((name for name in dir(bpy.ops.sna) if name.startswith("dgs_render_import_ply")), None)
+    if bpy.app.version < _NATIVE_SPLATS and kiri is not None:
+        getattr(bpy.ops.sna, kiri)("EXEC_DEFAULT", filepath=str(path))
+        said = "splats of KIRI 3DGS Render"
+    else:
+        bpy.ops.wm.ply_import(filepath=str(path))
+        said = "Blender's splats"
+    thing = next(new for new in bpy.data.objects if new not in before)
+    if said == "Blender's splats" and thing.type == "MESH":
+        _show_as_points(thing)
+        said = "coloured points, as neither Blender 5.3 nor the add-on KIRI 3DGS Render is here"
+    thing.name, thing["splatgraft"] = f"splatgraft {part}", part
+    # meshes get their light from map and lamps alone, which what the splats show would block or add to
+    thing.visible_shadow = thing.visible_diffuse = thing.visible_glossy = thing.visible_transmission = False
+    return thing, said
+
+
+def _show_as_points(thing):
+    """Give a mesh of Gaussians a colour attribute, and show its vertices as points of that colour."""
+    mesh, count = thing.data, len(thing.data.vertices)
+    values = {name: np.zeros(count, np.float32) for name in ("f_dc_0", "f_dc_1", "f_dc_2", "scale_0")}
+    for name, array in values.items():
+        mesh.attributes[name].data.foreach_get("value", array)
+    srgb = np.clip(0.5 + _SH_C0 * np.stack([values[f"f_dc_{i}"] for i in range(3)], 1), 0, 1)
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    colors = mesh.color_attributes.new("Col", "FLOAT_COLOR", "POINT")
+    colors.data.foreach_set("color", np.concatenate([linear, np.ones((count, 1))], 1).astype(np.float32).ravel())
+    material = bpy.data.materials.get("splatgraft points") or bpy.data.materials.new("splatgraft points")
+    material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    color, glow = nodes.new("ShaderNodeAttribute"), nodes.new("ShaderNodeEmission")
+    color.attribute_name = "Col"
+    links.new(color.outputs["Color"], glow.inputs["Color"])
+    links.new(glow.outputs[0], nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
+    tree = bpy.data.node_groups.new("splatgraft points", "GeometryNodeTree")
+    for direction in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
+    kinds = ("NodeGroupInput", "GeometryNodeMeshToPoints", "GeometryNodeSetMaterial", "NodeGroupOutput")
+    chain = [tree.nodes.new(kind) for kind in kinds]
+    chain[1].inputs["Radius"].default_value = float(np.exp(np.median(values["scale_0"])))
+    chain[2].inputs["Material"].default_value = material
+    for first, second in itertools.pairwise(chain):
+        tree.links.new(first.outputs[0], next(s for s in second.inputs if s.type == "GEOMETRY"))
+    thing.modifiers.new("points", "NODES").node_group = tree
+
+
+def _positions(thing):
+    found = np.zeros((len(thing.data.attributes["position"].data), 3), np.float32)
+    thing.data.attributes["position"].data.foreach_get("vector", found.ravel())
+    return found
+
+
+def upright_from_capture(cameras):
+    """The smallest rotation (4x4) that turns a capture's up, the mean of its cameras', to +z; -y is up without any."""
+    up = Vector((0.0, -1.0, 0.0))
+    if cameras.is_file():
+        frames = json.loads(cameras.read_text())["frames"]
+        up = Vector(np.mean([np.asarray(frame["transform_matrix"])[:3, 1] for frame in frames], 0))
+    return up.rotation_difference(Vector((0.0, 0.0, 1.0))).to_matrix().to_4x4()
+
+
+def _remove(*parts):
+    for thing in [one for one in bpy.data.objects if one.get("splatgraft") in parts]:
+        bpy.data.objects.remove(thing, do_unlink=True)
+
+
+def show_parts(paths):
+    """Import target and object, upright, the object in a box that is moved in its stead; gives what is said."""
+    _remove("root", "target", "object", "box", "relit", "lamp")
+    root = bpy.data.objects.new("splatgraft target frame", None)
+    root["splatgraft"] = "root"
+    bpy.context.scene.collection.objects.link(root)
+    root.matrix_world = upright_from_capture(paths.cameras)
+    target, said = import_splats(paths.target, "target")
+    target.parent = root
+    thing, _ = import_splats(paths.object, "object")
+    low, high = np.percentile(_positions(thing), [_STRAY, 100 - _STRAY], axis=0)
+    # a turned box is drawn around the turned points; it is the object's frame, with its origin in the middle
+    middle = Matrix.Translation(Vector(0.5 * (low + high)))
+    inner = upright_from_capture(paths.object_cameras if paths.knows_source else Path()) @ middle.inverted()
+    points = _positions(thing) @ np.array(inner.to_3x3()).T + np.array(inner.translation)
+    low, high = np.percentile(points, [_STRAY, 100 - _STRAY], axis=0)
+    mesh = bpy.data.meshes.new("splatgraft box")
+    corners = [[(low, high)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)]
+    mesh.from_pydata(corners, [(i, i | 1 << axis) for i in range(8) for axis in range(3) if not i >> axis & 1], [])
+    box = bpy.data.objects.new("splatgraft object: move me", mesh)
+    box["splatgraft"] = "box"
+    bpy.context.scene.collection.objects.link(box)
+    thing.parent, thing.matrix_local = box, inner
+    start = np.median(_positions(target) @ np.array(root.matrix_world.to_3x3()).T, 0)
+    box.matrix_world = Matrix.Translation(Vector(start))
+    bpy.context.view_layer.update()
+    box.parent, box.matrix_parent_inverse = root, root.matrix_world.inverted()
+    bpy.context.view_layer.objects.active = box
+    return f"{said}; move, turn and scale the box (captures have no common unit), then Relight"
+
+
+def target_from_object():
+    """Scale, rotation (3x3) and translation of the object in the target's capture; a ValueError where it is no such."""
+    root, thing = find("root"), find("object")
+    if root is None or thing is None:
+        raise ValueError("Relight: expected a target and an object in the scene, found none; press Load first")
+    bpy.context.view_layer.update()
+    matrix = np.array(root.matrix_world.inverted() @ thing.matrix_world, np.float64)
+    axes = matrix[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(axes)))
+    if not scale > 0 or np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() > _RIGID:
+        raise ValueError(
+            "Relight: expected one scale for all axes of the box and no mirroring, found another transform"
+        )
+    # the nearest rotation, as Blender's numbers are of single precision
+    left, _, right = np.linalg.svd(axes)
+    return scale, left @ right, matrix[:3, 3]
+
+
+def write_placement(paths):
+    """Write placement.json from the box's transform."""
+    scale, rotation, translation = target_from_object()
+    named = os.path.relpath(paths.object, paths.folder)
+    placed = {"object": named, "scale": scale, "rotation": rotation.tolist(), "translation": translation.tolist()}
+    paths.placement.write_text(json.dumps({"objects": [placed]}, indent=1))
+
+
+def show_result(paths):
+    """Import the relit scene in place of its parts, the lamps and the world; gives what is said."""
+    _remove("relit", "lamp")
+    root = find("root")
+    relit, said = import_splats(paths.relit, "relit")
+    relit.parent = root
+    for part in ("target", "object"):
+        find(part).hide_viewport = find(part).hide_render = True
+    place = root.matrix_world.inverted() @ find("box").matrix_world.translation
+    lamps = json.loads(paths.lamps.read_text())["sources"]
+    for lamp in lamps:
+        _add_lamp(lamp, root, place)
+    _set_world(paths.map, root)
+    return f"{said}; {len(lamps)} lamps; made at {time.strftime('%H:%M')}"
+
+
+def _add_lamp(lamp, root, place):
+    """A sun, or for a lamp at a distance a ball of light, in the root's axes."""
+    towards, away = Vector(lamp["direction"]), lamp.get("distance")
+    strength, radius = max(lamp["irradiance"]), math.radians(lamp.get("angular_radius_deg", 0.0))
+    light = bpy.data.lights.new(f"splatgraft {lamp['name']}", "SUN" if away is None else "POINT")
+    light.color = [channel / max(strength, 1e-9) for channel in lamp["irradiance"]]
+    if away is None:
+        light.energy, light.angle = strength, 2 * radius
+    else:
+        metres = away * root.matrix_world.median_scale
+        light.energy, light.shadow_soft_size = 4 * math.pi * metres**2 * strength, metres * math.tan(radius)
+    thing = bpy.data.objects.new(light.name, light)
+    thing["splatgraft"] = "lamp"
+    bpy.context.scene.collection.objects.link(thing)
+    thing.parent = root
+    turn = towards.to_track_quat("Z", "Y").to_matrix().to_4x4()
+    thing.matrix_local = Matrix.Translation(place + towards * (1.0 if away is None else away)) @ turn
+
+
+def _set_world(path, root):
+    """The environment map as the scene's world, turned as the root is."""
+    world = bpy.data.worlds.get("splatgraft") or bpy.data.worlds.new("splatgraft")
+    bpy.context.scene.world, world.use_nodes = world, True
+    nodes, links = world.node_tree.nodes, world.node_tree.links
+    nodes.clear()
+    kinds = ("TexCoord", "Mapping", "TexEnvironment", "Background", "OutputWorld")
+    start, mapping, image, background, end = (nodes.new(f"ShaderNode{kind}") for kind in kinds)
+    image.image = bpy.data.images.load(str(path), check_existing=True)
+    image.image.reload()
+    mapping.inputs["Rotation"].default_value = root.matrix_world.to_quaternion().inverted().to_euler()
+    links.new(start.outputs["Generated"], mapping.inputs["Vector"])
+    links.new(mapping.outputs["Vector"], image.inputs["Vector"])
+    links.new(image.outputs["Color"], background.inputs["Color"])
+    links.new(background.outputs["Background"], end.inputs["Surface"])
+
+
+class SPLATGRAFT_OT_load(bpy.types.Operator):
+    """Show target and object; a scene without a capture is first looked at from all around"""
+
+    bl_idname, bl_label = "splatgraft.load", "Load"
+
+    def execute(self, context):
+        return _begin(self, context, lambda paths: paths.preparing(), show_parts)
+
+
+class SPLATGRAFT_OT_relight(bpy.types.Operator):
+    """Give the object the light of the place where its box is, and the place the object's shadow"""
+
+    bl_idname, bl_label = "splatgraft.relight", "Relight"
+
+    def execute(self, context):
+        return _begin(self, context, lambda paths: write_placement(paths) or paths.relighting(), show_result)
+
+
+class SPLATGRAFT_OT_stop(bpy.types.Operator):
+    """End what runs"""
+
+    bl_idname, bl_label = "splatgraft.stop", "Stop"
+
+    def execute(self, context):
+        if Job.running is not None:
+            Job.running.stop()
+            context.scene.splatgraft.status = "stopped"
+        return {"FINISHED"}
+
+
+def _begin(operator, context, commands, done):
+    try:
+        if Job.running is not None:
+            raise ValueError("expected nothing that runs, found a command; wait, or press Stop")
+        paths = Paths(context.scene.splatgraft)
+        paths.folder.mkdir(parents=True, exist_ok=True)
+        Job(commands(paths), paths.folder / "splatgraft.log", lambda: done(paths))
+    except (OSError, ValueError) as error:
+        operator.report({"ERROR"}, str(error))
+        context.scene.splatgraft.status = str(error)
+        return {"CANCELLED"}
+    context.scene.splatgraft.status = "begins"
+    return {"FINISHED"}
+
+
+class SPLATGRAFT_PT_panel(bpy.types.Panel):
+    """The panel in the sidebar."""
+
+    bl_label, bl_space_type, bl_region_type, bl_category = "Splatgraft", "VIEW_3D", "UI", "Splatgraft"
+
+    def draw(self, context):
+        settings, column = context.scene.splatgraft, self.layout.column()
+        for name in ("source", "target", "folder", "command"):
+            column.prop(settings, name)
+        if Job.running is None:
+            column.operator("splatgraft.load", icon="IMPORT")
+            column.operator("splatgraft.relight", icon="LIGHT_SUN")
+        else:
+            column.operator("splatgraft.stop", icon="CANCEL")
+        for i in range(0, len(settings.status), 40):
+            column.label(text=settings.status[i : i + 40])
+
+
+_CLASSES = (Settings, SPLATGRAFT_OT_load, SPLATGRAFT_OT_relight, SPLATGRAFT_OT_stop, SPLATGRAFT_PT_panel)
+
+
+def register():
+    for kind in _CLASSES:
+        bpy.utils.register_class(kind)
+    bpy.types.Scene.splatgraft = PointerProperty(type=Settings)
+
+
+def unregister():
+    if Job.running is not None:
+        Job.running.stop()
+    while bpy.app.timers.is_registered(Job.poll):
+        bpy.app.timers.unregister(Job.poll)
+    del bpy.types.Scene.splatgraft
+    for kind in reversed(_CLASSES):
+        bpy.utils.unregister_class(kind)

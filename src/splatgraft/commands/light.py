@@ -1,0 +1,155 @@
+"""The command `light`: the estimated light at a place of a target as an environment map and a list of lamps."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.commands.steps.relight import Relight
+from splatgraft.core.bounds import BoundingSphere, bounding_sphere
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import write_radiance
+from splatgraft.core.rotations import rotation_between
+from splatgraft.folders.composite_folder import read_composite
+from splatgraft.formats import is_scene, read_cameras, read_gaussians
+from splatgraft.project.layout import CAMERAS_FILE, PROJECT_FILE, SCENE_FILE
+from splatgraft.project.step import Positional
+from splatgraft.relighting.light.environment import environment_radiance, equirectangular_directions
+from splatgraft.relighting.light.estimate import estimate_light
+from splatgraft.relighting.light.light import Light, light_to_json
+from splatgraft.relighting.light.panorama import NoLight
+from splatgraft.relighting.scene_light import place_of
+from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import atomic_write
+from splatgraft.workflow.flow import read_flow
+
+_RADIUS = 1 / 8
+"""Of the median distance of the cameras: the radius of a place without an object. All of the region that the cameras
+look at is then evidence, which reaches 8 radii at most."""
+_MIN_HEIGHT, _MAX_HEIGHT = 16, 4096
+"""Pixels of a panorama."""
+_BLENDER_FROM_DOWN_Y = torch.tensor([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
+"""From a capture whose up is -y to what Blender makes of the .glb that `export` writes of it."""
+
+
+@dataclass(frozen=True)
+class LightAt:
+    """Write the light at a place of a target, to light meshes of other programs with: an environment map (.hdr) of the
+    ambient light, with what the scene itself shows, and beside it a .json with the lamps (sun, windows, lamps). The map
+    is without the lamps: use both, nothing is in them twice.
+
+    The map is equirectangular, as Blender's World expects it: the top row is +z, the middle column +x, columns to the
+    right turn towards -y. It holds linear Rec. 709 radiance in the units of the capture, in which a white sky has 1;
+    the lamps' irradiance, on a plane that faces the lamp, has the same units: a white sky gives pi. Directions go from
+    the place to the lamp, distances are in units of the capture."""
+
+    target: Positional
+    """A project (its folder or project.toml), whose target it is; or a scene file, or a folder with scene.ply, with
+    its --cameras."""
+    out: Path = Path("light.hdr")
+    """The environment map; the lamps are written beside it, with the suffix .json."""
+    at: tuple[float, float, float] | None = None
+    """The place, x y z in the axes and units of the target's capture; where not given, the middle of the placed
+    objects."""
+    radius: float | None = None
+    """Half the width of what will stand there, units of the capture: what is nearer than half of it is left out. The
+    objects' own, or an eighth of the cameras' distance."""
+    cameras: Path | None = None
+    """The target's cameras, a capture folder or its transforms.json; found in a project."""
+    placement: Path | None = None
+    """placement.json, whose objects stand at the place and whose erased Gaussians are left out; found in a project."""
+    frame: Literal["world", "capture"] = "world"
+    """Axes of the map and of the lamps. world: z is up, as in Blender after it opened the .glb that `export` writes;
+    capture: those of the target's .ply."""
+    height: int = 512
+    """Rows of the map, which is twice as wide."""
+
+    def execute(self, console: Console) -> int:
+        """Estimate, and write both files; their paths are printed."""
+        if self.out.suffix.lower() != ".hdr":
+            raise ValueError(f"--out: expected a file that ends in .hdr, found {self.out.name}")
+        if not _MIN_HEIGHT <= self.height <= _MAX_HEIGHT:
+            raise ValueError(f"--height: expected {_MIN_HEIGHT} to {_MAX_HEIGHT} rows, found {self.height}")
+        if self.radius is not None and not self.radius > 0:
+            raise ValueError(f"--radius: expected a number above 0, found {self.radius:g}")
+        step = self._step()
+        scene, spheres = _scene_of(step)
+        cameras = read_cameras(step.cameras)
+        place = self._place(step, spheres, cameras)
+        up = estimate_up(cameras)
+        turn = None if self.frame == "capture" else _BLENDER_FROM_DOWN_Y @ rotation_between(up, -torch.eye(3)[1])
+        directions = equirectangular_directions(self.height)
+        directions = directions if turn is None else directions @ turn
+        with console.bar("light"):
+            light, radiance = _light_at(step, scene, cameras, place, directions)
+        write_radiance(self.out, radiance)
+        lamps = self.out.with_suffix(".json")
+        with atomic_write(lamps) as stream:
+            stream.write(light_to_json(light, world_from_capture=turn).encode())
+        console.say(f"The light at {', '.join(f'{v:.3g}' for v in place.center.tolist())}: {light.describe(up)}.")
+        console.result(self.out)
+        console.result(lamps)
+        return 0
+
+    def _step(self) -> Relight:
+        """The step that would relight the target: which files it reads, and which light it is given."""
+        root = self.target.parent if self.target.name == PROJECT_FILE else self.target
+        if (root / PROJECT_FILE).is_file():
+            step = read_flow(root).steps["relight"]
+            assert isinstance(step, Relight)
+            return replace(step, placement=self.placement or step.placement, cameras=self.cameras or step.cameras)
+        scene = self.target if is_scene(self.target) else self.target / SCENE_FILE
+        if not scene.exists():
+            raise ValueError(
+                f"{self.target}: expected a project, a scene or a folder with {SCENE_FILE}, found none of them"
+            )
+        beside = scene.parent.parent / "capture" / CAMERAS_FILE
+        cameras = self.cameras or (beside if beside.is_file() else None)
+        if cameras is None:
+            raise ValueError(f"--cameras: expected the capture that {scene} was made from, found none")
+        return Relight(target=scene, placement=self.placement or Path(), cameras=cameras)
+
+    def _place(self, step: Relight, spheres: list[BoundingSphere], cameras: Cameras) -> BoundingSphere:
+        if self.at is None and not spheres:
+            raise ValueError(
+                f"--at: expected x y z, or a placed object in {step.placement}, found neither; "
+                "`splatgraft run PROJECT --to compose` places one"
+            )
+        if self.at is None:
+            found = place_of(spheres)
+            return found if self.radius is None else BoundingSphere(found.center, self.radius)
+        center = torch.tensor(self.at)
+        return BoundingSphere(center, self.radius or _RADIUS * float((cameras.centers - center).norm(dim=1).median()))
+
+
+def _scene_of(step: Relight) -> tuple[Gaussians, list[BoundingSphere]]:
+    """The target without what is erased, and the spheres of the objects that are placed in it."""
+    if not step.placement.is_file():
+        return read_gaussians(step.target), []
+    composite = read_composite(step.target, step.placement)
+    placed = [one.in_target() for one in composite.objects if one.gaussians.count]
+    return composite.target.select(~composite.erased), [bounding_sphere(one) for one in placed]
+
+
+def _light_at(
+    step: Relight, scene: Gaussians, cameras: Cameras, place: BoundingSphere, directions: Float[Tensor, "h w 3"]
+) -> tuple[Light, Float[Tensor, "h w 3"]]:
+    """The light as `relight` takes it, and the radiance from `directions` without its sources.
+
+    Of a light that was given all is known that there is: its own ambient light is the radiance.
+    """
+    given = step.given()
+    if given is not None:
+        return given, given.ambient_radiance(directions.reshape(-1, 3)).reshape(directions.shape)
+    found = estimate_light(scene, place, cameras, sun_through=step.options.sun_through)
+    if isinstance(found, NoLight):
+        raise ValueError(f"--at: expected a place with light around it, found none. {found.reason}")
+    return found.light, environment_radiance(found, scene, place, directions)
+
+
+COMMAND = LightAt

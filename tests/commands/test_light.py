@@ -1,0 +1,146 @@
+"""`light`: its environment map and lamps light a sphere as the known light does; conventions; a project's light."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+from shapes import ring, sunlit_scene
+from torch import Tensor
+
+from splatgraft.cli import main
+from splatgraft.core.directions import even_directions
+from splatgraft.core.similarity import Similarity
+from splatgraft.formats import write_cameras, write_gaussians
+from splatgraft.relighting.light.light import light_from_json
+
+SUN = torch.nn.functional.normalize(torch.tensor([-0.39, 0.67, 0.8]), dim=0)
+STRENGTH = 3.0
+"""Irradiance of the sun on what faces it, over the sky's on the floor."""
+FLOOR = 0.15 * (1 + STRENGTH * float(SUN[2]))
+"""Linear value of the lit floor's pixels, of the albedo that `sunlit_scene` has."""
+CAPTURE_FROM_WORLD = torch.tensor([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
+"""A capture as structure from motion has it, y down, so turned that a .glb of it opens in Blender as the world."""
+
+
+def pixels(height: int) -> tuple[Tensor, Tensor]:
+    """Directions and solid angles of a map, by the words of `--help`: top +z, middle column +x, to the right -y."""
+    rows, columns = (torch.arange(n, dtype=torch.float64) + 0.5 for n in (height, 2 * height))
+    up, right = math.pi * (0.5 - rows / height)[:, None], math.pi * (columns / height - 1)[None]
+    directions = torch.stack([up.cos() * right.cos(), -up.cos() * right.sin(), up.sin() + 0 * right], -1)
+    return directions.float(), (up.cos() * (math.pi / height) ** 2).expand(height, 2 * height).float()
+
+
+def read_hdr(path: Path) -> Tensor:
+    found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert found is not None
+    return torch.from_numpy(found[..., ::-1].copy())
+
+
+def lit_by_map(radiance: Tensor, normals: Tensor) -> Tensor:
+    """Irradiance (n 3) on planes."""
+    directions, angles = (values.flatten(0, 1) for values in pixels(len(radiance)))
+    return ((normals @ directions.T).clamp_min(0) * angles) @ radiance.flatten(0, 1)
+
+
+def lit_by_lamps(path: Path, normals: Tensor) -> Tensor:
+    total = torch.zeros(len(normals), 3)
+    for lamp in json.loads(path.read_text())["sources"]:
+        cosine = (normals @ torch.tensor(lamp["direction"])).clamp_min(0)
+        total += cosine[:, None] * torch.tensor(lamp["irradiance"])
+    return total
+
+
+@pytest.fixture(scope="module")
+def sunlit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder with what `light` wrote of a scene under a sun and an even sky that no camera saw."""
+    folder = tmp_path_factory.mktemp("sunlit")
+    turned = Similarity(1.0, CAPTURE_FROM_WORLD, torch.zeros(3))
+    write_gaussians(folder / "target.ply", turned.gaussians(sunlit_scene(SUN, STRENGTH)))
+    write_cameras(folder / "transforms.json", turned.cameras(ring()))
+    at = ["--at", *(str(v) for v in turned.points(torch.tensor([0.0, 0.0, 0.3])).tolist()), "--radius", "0.3"]
+    words = ["light", str(folder / "target.ply"), "--cameras", str(folder / "transforms.json"), *at]
+    assert main([*words, "--out", str(folder / "light.hdr"), "--height", "128"]) == 0
+    return folder
+
+
+def test_a_sphere_is_lit_as_by_the_known_sun_and_sky(sunlit: Path):
+    normals = even_directions(2000)
+    normals = normals[normals[:, 2] > 0]
+    by_map, by_lamps = lit_by_map(read_hdr(sunlit / "light.hdr"), normals), lit_by_lamps(sunlit / "light.json", normals)
+    found, by_sun = (by_map + by_lamps).mean(1), STRENGTH * math.pi * (normals @ SUN).clamp_min(0)
+    # the sky over the horizon, the lit floor below it
+    known = by_sun + math.pi * (1 + normals[:, 2]) / 2 + FLOOR * math.pi * (1 - normals[:, 2]) / 2
+    # normals lie 4.5 degrees apart, and the sun is found within 3
+    assert float(normals[found.argmax()] @ normals[known.argmax()]) > math.cos(math.radians(8))
+    # the level of the light is free, as the floor's albedo is not known; of the sun's share 0.1 may be the sky's
+    assert float((found / found.max() - known / known.max()).abs().max()) < 0.1
+    top = normals[:, 2].argmax()
+    share = float(by_lamps[top].mean() / found[top])
+    # 0.1 as in relighting/test_light.py, where Gaussians mix lit and shaded floor at the edges of shadows; and 0.01, as
+    # the map's irradiance is within 3% of what harmonics of degree 2 give there
+    assert share == pytest.approx(float(by_sun[top] / (by_sun[top] + math.pi)), abs=0.11)
+
+
+def test_the_map_shows_the_scene_s_own_pixels_below_its_horizon_and_no_lamp(sunlit: Path):
+    radiance, (directions, _) = read_hdr(sunlit / "light.hdr"), pixels(128)
+    assert (sunlit / "light.hdr").read_bytes().startswith(b"#?RADIANCE\n")
+    assert radiance.shape == (128, 256, 3)
+    # linear radiance of the lit floor; near the place a ball takes 2% of the sky, and alpha is not quite 1
+    floor = radiance[directions[..., 2] < -0.3].median(0).values
+    assert floor.tolist() == pytest.approx([FLOOR] * 3, rel=0.03)
+    # the sun of the lamps would be above 1000: its 0.3 degrees have 9e-5 steradians
+    assert float(radiance.max()) < 10
+    assert lit_by_lamps(sunlit / "light.json", SUN[None]).mean() > 3
+
+
+def test_the_lamps_can_be_given_back_in_the_axes_of_the_capture(sunlit: Path):
+    text = (sunlit / "light.json").read_text()
+    back = light_from_json(text)
+    towards = CAPTURE_FROM_WORLD @ SUN
+    assert float(torch.tensor(back.sources[0].direction) @ towards) > math.cos(math.radians(3))
+    # six decimals of coefficients and directions
+    normals = even_directions(50)
+    plain = json.loads(text)
+    del plain["world_from_capture"]
+    in_world = light_from_json(json.dumps(plain)).irradiance(normals)
+    assert torch.allclose(back.irradiance(normals @ CAPTURE_FROM_WORLD.T), in_world, atol=1e-4)
+    for broken in ([[1, 0, 0], [0, 1, 0]], [[1, 0, 0], [0, 1, 0], [0, 0, -1]], [[1, 0, 0], [0, 1, 0], [0, 0.5, 1]]):
+        with pytest.raises(ValueError, match=r"my\.json: world_from_capture: expected"):
+            light_from_json(json.dumps(plain | {"world_from_capture": broken}), name="my.json")
+
+
+def test_at_a_project_s_object_it_is_the_light_that_relight_finds(copy_project: Callable[[], Path], capsys):
+    project = copy_project()
+    out = project / "light.hdr"
+    words = {"target": "target/scene/scene.ply", "placement": "composite/placement.json", "out": "again"}
+    words |= {"cameras": "target/capture/transforms.json"}
+    given = [word for name, path in words.items() for word in (f"--{name}", str(project / path))]
+    assert main(["relight", *given, "--fitted-views", "0"]) == 0
+    assert main(["light", str(project), "--out", str(out), "--frame", "capture", "--height", "16"]) == 0
+    assert out.with_suffix(".json").read_text() == (project / "again" / "light.json").read_text()
+    # a light that the project is given is the light: its ambient light is the map
+    light = json.loads(out.with_suffix(".json").read_text())
+    ambient = [[0.5 / 0.28209479] * 3, *[[0.0] * 3] * 8]
+    (project / "given.json").write_text(json.dumps(light | {"sources": [], "ambient_sh": ambient}))
+    file = project / "project.toml"
+    file.write_text(file.read_text().replace('light = "gain"', 'given_light = "given.json"'))
+    assert main(["light", str(file), "--out", str(out), "--height", "16"]) == 0
+    # 8 bits of mantissa
+    assert torch.allclose(read_hdr(out), torch.tensor(0.5), rtol=1 / 256)
+    capsys.readouterr()
+    for wrong, line in (
+        (["--out", "light.png"], "--out: expected a file that ends in .hdr, found light.png"),
+        (["--height", "1"], "--height: expected 16 to 4096 rows, found 1"),
+        (["--radius", "0"], "--radius: expected a number above 0, found 0"),
+        (["--placement", str(project / "none.json")], "--at: expected x y z, or a placed object in"),
+    ):
+        assert main(["light", str(project), *wrong]) == 2
+        assert line in capsys.readouterr().err
+    assert main(["light", str(project / "object" / "object.ply")]) == 2
+    assert "--cameras: expected the capture that" in capsys.readouterr().err
+    assert main(["light", str(project / "views")]) == 2
+    assert "views: expected a project, a scene or a folder with scene.ply" in capsys.readouterr().err
