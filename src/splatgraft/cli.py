@@ -106,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, MemoryError) as error:
         if debug:
             raise
-        return _fail(" ".join(str(error).split()) or type(error).__name__, 2)
+        return _fail(_in_one_line(error), 2)
 
 
 def _dispatch(words: list[str]) -> int:
@@ -192,6 +192,14 @@ _TAIL = """
 def _help(head: str, commands: Mapping[str, str]) -> str:
     lines = [f"  {name:<22} {summary}" for name, summary in commands.items()]
     return "\n".join([f"{head}\n\ncommands:", *lines])
+
+
+def _in_one_line(error: Exception) -> str:
+    if isinstance(error, OSError):
+        from splatgraft.runtime.files import os_error_line
+
+        return os_error_line(error)
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _fail(sentence: str, code: int) -> int:

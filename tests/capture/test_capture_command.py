@@ -267,6 +267,11 @@ def test_a_zip_whose_photos_are_damaged_inside_leaves_nothing(tmp_path: Path) ->
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"c\.zip: expected a \.zip of photos, found one that cannot be read"):
         unpack_photos(path, tmp_path / "photos")
+    # of bzip2, zipfile would unpack the whole at once, however large it is
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as archive:
+        archive.writestr("0.png", bytes(1000))
+    with pytest.raises(ValueError, match=r"c\.zip: expected a \.zip of photos, found one that is not deflated"):
+        unpack_photos(path, tmp_path / "photos")
     assert [entry.name for entry in tmp_path.iterdir()] == ["c.zip"]
 
 

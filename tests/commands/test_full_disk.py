@@ -1,11 +1,15 @@
-"""Where there is no room on the disk, a run ends with one line, and what was there before is still whole."""
+"""Where there is no room on the disk, or no right to write, a command ends with one line and leaves what was there."""
 
+import ctypes
 import errno
 import os
 import re
 import resource
+import struct
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,6 +19,53 @@ from splatgraft.cli import main
 from splatgraft.commands.steps.render import Render
 from splatgraft.project.step import Context
 from splatgraft.workflow.flow import read_flow
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """Let no file grow beyond this many bytes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@contextmanager
+def read_only(folder: Path) -> Iterator[None]:
+    """Take the right to write into a folder, also from root."""
+    folders = [folder, *(path for path in folder.rglob("*") if path.is_dir())]
+    for path in folders:
+        path.chmod(0o555)
+    try:
+        with heeding_permissions():
+            with pytest.raises(PermissionError):
+                (folder / "new").touch()
+            yield
+    finally:
+        for path in folders:
+            path.chmod(0o755)
+
+
+@contextmanager
+def heeding_permissions() -> Iterator[None]:
+    """Let this thread heed the permissions of files, as root too does without two of its capabilities."""
+    if os.geteuid() != 0:
+        yield
+        return
+    if sys.platform != "linux":
+        pytest.skip("root heeds no permissions")
+    libc, header = ctypes.CDLL(None, use_errno=True), struct.pack("<Ii", 0x20080522, 0)
+    had = ctypes.create_string_buffer(24)  # linux/capability.h: two of effective, permitted, inheritable
+    assert libc.capget(header, had) == 0
+    effective, *others = struct.unpack("<6I", had.raw)
+    # CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH
+    assert libc.capset(header, struct.pack("<6I", effective & ~0b110, *others)) == 0
+    try:
+        yield
+    finally:
+        assert libc.capset(header, had.raw) == 0
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +89,50 @@ def test_a_writer_without_room_is_one_line_and_the_earlier_result_stays(
     wanted = contents(out)
     assert main(["run", str(finished), "--to", "render", "--force", "render"]) == 2
     last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith(f"splatgraft: {out}: expected room to write the result, found the disk full")
+    assert last.startswith(
+        f"splatgraft: {out}: expected room to write it, found no space left on the disk; earlier results are complete"
+    )
     assert contents(out) == wanted
     assert not list(finished.parent.rglob(".*.new"))
+
+
+@pytest.mark.parametrize(
+    ("name", "most"), [("a.ply", 999), ("a.sog", 999), ("a.gif", 999), ("a.mp4", 99), ("a.mp4", 6000)]
+)
+def test_an_export_without_room_is_one_line_and_leaves_nothing(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, most: int
+) -> None:
+    with files_of_at_most(most):
+        assert main(["export", str(finished), "--to", str(tmp_path / name)]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    # OpenCV does not say why it wrote less
+    found = r"found (a limit on the size of files|\d+ written, with .* on the disk)"
+    assert re.match(rf"splatgraft: {tmp_path / name}: expected .*, {found}$", last), last
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_read_only_project_is_up_to_date_or_says_what_it_cannot_write(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project, capture = finished.parent, str(finished.parents[1] / "photos" / "source")
+    (project / "source" / ".scene.new").mkdir()  # as a kill leaves it
+    commands = {
+        "views": ["run", str(finished), "--force", "render"],
+        ".edit.lock": ["edit", str(project)],
+        "a.ply": ["export", str(finished), "--to", str(project / "a.ply")],
+        "a.mp4": ["export", str(finished), "--to", str(project / "a.mp4")],
+        "new": ["init", str(project / "new"), "--source", capture, "--target", capture],
+    }
+    with read_only(project):
+        assert main(["run", str(finished)]) == 0
+        assert capsys.readouterr().out.splitlines()[-1] == str(project / "report" / "index.html")
+        for name, words in commands.items():
+            assert main(words) == 2
+            last = capsys.readouterr().err.splitlines()[-1]
+            assert re.match(
+                rf"splatgraft: {project}/{name}: expected .*, found:? (a read-only folder|permission denied)", last
+            )
+    (project / "source" / ".scene.new").rmdir()
 
 
 def run(project: Path, *words: str, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
@@ -64,7 +156,7 @@ def test_files_beyond_the_limit_are_one_line_and_earlier_results_stay(finished: 
         assert done.returncode == 2
         assert "Traceback" not in done.stderr
         last = done.stderr.splitlines()[-1]
-        assert re.match(r"splatgraft: .*: expected room to write the result, found a limit on the size of files", last)
+        assert re.match(r"splatgraft: .*: expected room to write it, found a limit on the size of files", last)
         assert str(read_flow(finished).steps[step].out) in last
         assert {folder: contents(folder) for folder in wanted} == wanted
         assert not list(finished.parent.rglob(".*.new"))

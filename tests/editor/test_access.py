@@ -68,7 +68,7 @@ def test_a_page_s_query_may_hold_the_token_alone() -> None:
 def test_the_server_refuses_what_is_foreign_and_serves_only_shared_files(tmp_path: Path) -> None:
     (tmp_path / "a.sog").write_bytes(b"scene")
     with served() as guarded:
-        guarded.files = lambda name: tmp_path / name if name == "a.sog" else None
+        guarded.files = lambda name: path if (path := (tmp_path / name).resolve()).name == "a.sog" else None
 
         def answer(path: str, **headers: str) -> http.client.HTTPResponse:
             connection = http.client.HTTPConnection("127.0.0.1", guarded.port, timeout=600)
@@ -91,7 +91,8 @@ def test_the_server_refuses_what_is_foreign_and_serves_only_shared_files(tmp_pat
         assert answer(f"/?token={TOKEN}", Origin="http://evil.example").status == 403
         assert answer(f"/?token={TOKEN}", Host="evil.example").status == 403
         assert answer(f"/?token={TOKEN}&websocket=ws://evil.example").headers["Location"] == f"?token={TOKEN}"
-        for path in ("/files/../project.toml", "/files/%2e%2e/project.toml", "/project.toml", "/files/"):
+        outside = ("/files/../project.toml", "/files/%2e%2e/project.toml", "/project.toml", "/files/", "/files/b/a.sog")
+        for path in (*outside, "/files/%00", f"/files/{'a' * 5000}", f"/{'a' * 5000}", "/%00"):
             assert answer(path, Cookie=cookie).status == 404, path
 
 

@@ -8,6 +8,7 @@ import re
 import shutil
 import struct
 import tracemalloc
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -249,6 +250,19 @@ def test_picture_bomb(tmp_path):
     struct.pack_into("<I", huge, at, bits & 0xF0000000 | 8999 << 14 | 8999)
     path = format_files.write_zip(tmp_path / "a.sog", files | {"means_l.webp": bytes(huge)})
     assert "found 9000 x 9000" in refused(path)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2])
+def test_sog_that_unpacks_without_measure(tmp_path, method):
+    path = tmp_path / "a.sog"
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr("meta.json", b" " * (128 << 20))
+    assert "found 134217728 bytes" in refused(path)
+    # the same with a smaller size stated, 24 bytes into its entry of the directory
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, data.index(b"PK\x01\x02") + 24, 1000)
+    path.write_bytes(data)
+    refused(path)
 
 
 def test_sog_with_another_meta_json_or_names_of_files_elsewhere(tmp_path, seeds):

@@ -171,6 +171,7 @@ def test_what_a_kill_between_two_renames_left_is_put_back(tmp_path: Path) -> Non
 
 
 def test_one_run_at_a_time(tmp_path: Path) -> None:
+    (tmp_path / "scene").mkdir()
     with locked(tmp_path / "scene"):
         with pytest.raises(ValueError, match=r"scene: expected no other run at work here"), locked(tmp_path / "scene"):
             pass

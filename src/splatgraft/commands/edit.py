@@ -13,6 +13,7 @@ from splatgraft.editor.access import LOOPBACK
 from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import is_writable
 from splatgraft.runtime.process import end_process, open_page
 
 
@@ -48,6 +49,8 @@ class Edit:
         path = self.project.absolute()
         file = path if path.suffix == ".toml" else path / PROJECT_FILE
         out = None if self.out is None else self.out.absolute()
+        if out is not None and not is_writable(out):
+            raise ValueError(f"{out}: expected a folder for the results, found a read-only one")
         with locked(file.parent / "edit"):
             token = secrets.token_urlsafe(16)
             guarded = GuardedServer(token, host=LOOPBACK[0], port=self.port)

@@ -11,6 +11,7 @@ from splatgraft.folders.export_source import project_of, read_export_source
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE, Layout
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import room_on_disk
 from splatgraft.runtime.note import Note
 from splatgraft.workflow.run import stale_steps
 
@@ -53,7 +54,7 @@ class Export:
         else:
             source = read_export_source(self.scene, cameras=self.cameras)
             source = source if self.title is None else replace(source, title=self.title)
-            with console.bar("export") as progress:
+            with console.bar("export") as progress, room_on_disk(self.to):
                 said = export_scene(source, self.to, self.options, progress=progress)
         size, seconds = self.to.stat().st_size / 1e6, time.monotonic() - began
         return (*(f"{self.to}: {sentence}" for sentence in said), f"{self.to}: {size:.1f} MB in {seconds:.1f} s")

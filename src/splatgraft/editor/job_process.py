@@ -15,6 +15,7 @@ from typing import TypeVar
 
 from splatgraft.editor.jobs import JobState, PlannedStep, acquire_job_lock, write_state
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import os_error_line
 from splatgraft.runtime.progress import Progress
 
 T = TypeVar("T")
@@ -76,7 +77,8 @@ def main(arguments: Sequence[str]) -> int:
         console.write(replace(console.state, outcome="cancelled"))
         return 130
     except (ValueError, OSError, MemoryError, ModuleNotFoundError) as error:
-        console.write(replace(console.state, outcome="failed", error=" ".join(str(error).split())))
+        line = os_error_line(error) if isinstance(error, OSError) else " ".join(str(error).split())
+        console.write(replace(console.state, outcome="failed", error=line))
         return 2
     finally:
         lock.release()

@@ -15,7 +15,7 @@ from typing import Literal
 
 import filelock
 
-from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.files import atomic_write, writable
 
 _STATE_FILE, _LOG_FILE, _LOCK_FILE = "job.json", "job.log", "job.lock"
 Outcome = Literal["running", "done", "failed", "cancelled", "killed"]
@@ -131,8 +131,9 @@ class Jobs:
         state = self.state()
         if state is not None and state.live:
             raise ValueError(f"{state.title}: expected no other job, found this one running; wait or cancel it")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        (self.folder / _STATE_FILE).unlink(missing_ok=True)
+        with writable(self.folder / _LOG_FILE):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / _STATE_FILE).unlink(missing_ok=True)
         with (self.folder / _LOG_FILE).open("wb") as log:
             self._child = subprocess.Popen(
                 list(command), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True

@@ -1,6 +1,7 @@
 """Pictures of a scene: one from the first view, or a turntable as an animation or a video."""
 
 import os
+import shutil
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
@@ -18,10 +19,12 @@ from splatgraft.core.images import write_image
 from splatgraft.evaluation import write_animation
 from splatgraft.exports.export_source import FirstView
 from splatgraft.rendering import render
-from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.files import atomic_write, writable
 from splatgraft.runtime.progress import Progress, silent
 
 FPS = 24
+_LEAST_BYTES = 1 << 12
+"""No video is smaller; a disk with less room is full."""
 _QUALITY = "19"
 """Constant rate factor of x264: no loss is seen."""
 
@@ -67,6 +70,8 @@ def write_video(path: Path, frames: Iterable[Float[Tensor, "h w 3"]]) -> str:
         raise ValueError(f"{path}: expected an existing folder to write into, found no {path.parent}")
     partial = path.with_name(f".{path.stem}.partial.mp4")
     try:
+        with writable(path):
+            partial.write_bytes(bytes(_LEAST_BYTES))
         codec = _by_pyav(partial, frames) if find_spec("av") else _by_opencv(path, partial, frames)
         os.replace(partial, path)
     finally:
@@ -94,11 +99,11 @@ def _by_pyav(path: Path, frames: Iterable[Float[Tensor, "h w 3"]]) -> str:
 def _by_opencv(path: Path, partial: Path, frames: Iterable[Float[Tensor, "h w 3"]]) -> str:
     import cv2
 
-    writer, written = None, None
+    writer, written, count = None, None, 0
     # a frame is encoded while the next one is made
     with ThreadPoolExecutor(1) as pool:
         for frame in frames:
-            pixels = _bytes(frame)
+            pixels, count = _bytes(frame), count + 1
             if writer is None:
                 size = (pixels.shape[1], pixels.shape[0])
                 writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"vp09"), FPS, size)
@@ -111,7 +116,20 @@ def _by_opencv(path: Path, partial: Path, frames: Iterable[Float[Tensor, "h w 3"
             written.result()
     if writer is not None:
         writer.release()
+        _check_video(path, partial, count)
     return "VP9"
+
+
+def _check_video(path: Path, partial: Path, frames: int) -> None:
+    """Read the number of frames back: OpenCV says nothing of what it cannot write."""
+    import cv2
+
+    written = cv2.VideoCapture(str(partial))
+    found = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
+    written.release()
+    if found != frames:
+        room = f"{shutil.disk_usage(path.parent).free / 1e6:.1f} MB of room"
+        raise ValueError(f"{path}: expected a video of {frames} frames, found {found} written, with {room} on the disk")
 
 
 def _bytes(frame: Float[Tensor, "h w 3"]) -> np.ndarray:

@@ -15,7 +15,7 @@ import tyro
 
 from splatgraft.project.record import STEP_FILE, Job, Record, read_record, write_record
 from splatgraft.runtime.console import Console
-from splatgraft.runtime.files import atomic_folder, atomic_write, room_on_disk
+from splatgraft.runtime.files import atomic_folder, atomic_write, room_on_disk, writable
 from splatgraft.runtime.note import Note
 from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
 from splatgraft.runtime.progress import Progress
@@ -29,6 +29,7 @@ Device = Literal["auto", "cpu", "cuda"]
 Inputs = Mapping[str, tuple[Path, ...]]
 _MACHINE = ("device", "batch", "compile", "processes", "ray", "max_cost", "accept_doubtful")
 """Options that change where and how fast a step runs, or whether a run goes on after it, not its result."""
+_CONTINUES = "; earlier results are complete, and the same command continues when there is room"
 DEFAULT_REMEDIES = {
     "capture": "add or replace the photos named, or take more, sharper and with more overlap: splatgraft check PHOTOS",
     "reconstruct": "leave the named photos out, or lock exposure and photograph again: splatgraft check PHOTOS",
@@ -131,7 +132,7 @@ def perform(step: Step, console: Console, *, name: str = "") -> Path:
     """
     job = job_of(step)
     _ = job.entries  # what is missing is said before anything is touched
-    with locked(job.folder), room_on_disk(job.folder), console.collecting() as warned:
+    with locked(job.folder), room_on_disk(job.folder, _CONTINUES), console.collecting() as warned:
         checkpoint = FolderCheckpoint(job)
         with console.bar(name or job.step) as progress, replacing(job, warned) as folder:
             step.write(folder, Context(progress=progress, checkpoint=checkpoint, console=console))
@@ -173,13 +174,16 @@ def plain_options(values: Mapping[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def locked(folder: Path) -> Generator[None]:
-    """Lock `folder` for this process; a ValueError where another process holds the lock."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    lock = filelock.FileLock(folder.with_name(f".{folder.name}.lock"))
+    """Lock `folder` for this process; a ValueError where another process holds the lock, or it cannot be written."""
+    file = folder.with_name(f".{folder.name}.lock")
+    lock = filelock.FileLock(file)
     try:
-        lock.acquire(timeout=0)
+        with writable(file):
+            folder.parent.mkdir(parents=True, exist_ok=True)
+            lock.acquire(timeout=0)
     except filelock.Timeout as error:
-        raise ValueError(f"{folder}: expected no other run at work here, found one; wait for it or end it") from error
+        where = folder if folder.exists() else folder.parent
+        raise ValueError(f"{where}: expected no other run at work here, found one; wait for it or end it") from error
     try:
         yield
     finally:

@@ -1,5 +1,6 @@
 """Running a project and reading its state: what the commands `run` and `status` do, also from Python."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 from splatgraft.commands.steps.capture import Capture, doubt_about
@@ -7,6 +8,7 @@ from splatgraft.project.layout import REPORT_FILE, SCENE_FILE
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import clear_leftovers, job_of, locked, perform
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.files import is_writable
 from splatgraft.workflow.flow import read_flow, reasons
 from splatgraft.workflow.time_estimate import describe_estimate, estimate_step_times
 
@@ -30,7 +32,9 @@ def run_steps(
         console.say(line)
     wanted = flow.up_to(to)
     forced = {step for name in force for step in flow.named(name)}
-    with locked(flow.layout.root / "project"):
+    root = flow.layout.root
+    # where nothing can be written, nothing needs a lock: all may be up to date, else the step says what it cannot write
+    with locked(root / "project") if is_writable(root) else nullcontext():
         why = reasons(flow, wanted)
         planned = estimate_step_times(flow, [name for name in wanted if name in forced or why[name] is not None])
         if planned:
@@ -40,7 +44,7 @@ def run_steps(
             console.say(f"{name:<20} {reason or 'up to date'}")
             if reason:
                 perform(step, console, name=name)
-            else:
+            elif is_writable(step.out.parent):
                 clear_leftovers(step.out)
             if isinstance(step, Capture) and not accept_doubtful and (doubt := doubt_about(step)):
                 raise ValueError(doubt)

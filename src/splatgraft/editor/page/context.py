@@ -18,7 +18,7 @@ from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.server import GuardedServer
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session, Stamps, stamps_of
-from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.files import atomic_write, os_error_line
 
 VIEW_ORDER, STATUS_ORDER, HISTORY_ORDER, MORE_ORDER = 0.5e6, 1e6, 2e6, 3e6
 """Places in the panel of what stands below the phases."""
@@ -131,7 +131,9 @@ class PageContext:
         """Show an error of the block in the status line instead of raising it."""
         try:
             yield
-        except (ValueError, OSError) as error:
+        except OSError as error:
+            self.say(os_error_line(error), bad=True)
+        except ValueError as error:
             self.say(str(error), bad=True)
         except Exception as error:  # a programming error must be visible and must not end the page
             traceback.print_exc()

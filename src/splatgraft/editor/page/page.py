@@ -56,6 +56,8 @@ class Page:
         gui = context.gui
         self._header = gui.add_html("")
         self._notices: dict[int, viser.GuiHtmlHandle] = {}
+        # windows open and close in several threads; the context's lock may be held by one that waits for a window
+        self._notices_lock = threading.Lock()
         self._views: dict[str, tuple[Any, ...]] = {}
         self._phase_buttons = gui.add_button_group("Step", PHASES)
         gui.add_html(_CSS.format(steps=self._phase_buttons._impl.uuid))
@@ -235,14 +237,15 @@ class Page:
 
     def _windows_changed(self) -> None:
         """Say in each window but the oldest that it is read-only, and show the picture in the one that edits."""
-        watching = {window.client_id: window for window in self.context.guarded.watching()}
-        for number in [number for number in self._notices if number not in watching]:
-            notice = self._notices.pop(number)
-            if number in self.context.server.get_clients():
-                notice.remove()
-        for number, window in watching.items():
-            if number not in self._notices:
-                self._notices[number] = window.gui.add_html(note(_WATCH_NOTE, kind="watch"), order=-1.0)
+        with self._notices_lock:
+            watching = {window.client_id: window for window in self.context.guarded.watching()}
+            for number in [number for number in self._notices if number not in watching]:
+                notice = self._notices.pop(number)
+                if number in self.context.server.get_clients():
+                    notice.remove()
+            for number, window in watching.items():
+                if number not in self._notices:
+                    self._notices[number] = window.gui.add_html(note(_WATCH_NOTE, kind="watch"), order=-1.0)
         self.preview.update()
 
     def _save_view(self, scene: str) -> None:

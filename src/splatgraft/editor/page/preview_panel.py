@@ -128,7 +128,7 @@ class PreviewPanel:
         self._canvas_size: tuple[float, int] = (0.0, 0)
         self._is_on_canvas = False
         """Whether the newest request is for the canvas."""
-        self._told: tuple[int, viser.GuiHtmlHandle] | None = None
+        self._told: tuple[viser.ClientHandle, viser.GuiHtmlHandle] | None = None
         """The window whose script was told of its picture, and where."""
         self._version = 0
         self.light_ready: Callable[[], None] = lambda: None
@@ -166,6 +166,10 @@ class PreviewPanel:
             control.visible = self._context.phase != "Select"
         self._camera_slider.value = 1
         self._drawn = Memo()
+        self._is_on_canvas = False
+        self.canvas.clear()
+        if self._told is not None:
+            self._tell(self._told[0], [], None, ())
         self._show_cameras()
 
     def set_dragged_state(self, state: EditState | None) -> None:
@@ -329,16 +333,19 @@ class PreviewPanel:
             self.canvas.show(request.window, with_badge(right.pixels, stage), right.depth)
             self._shown_pose = _pose(request.camera)
             self._picture_seconds = seconds if stage != "coarse" else self._picture_seconds
-        self._say(" &middot; ".join((*self._described(request), *filter(None, (note,)), *problems)))
+        # what is chosen above need not be said again
+        kind = f'<span style="display:none">{request.right}</span>'
+        self._say(kind + " &middot; ".join((*self._described(request), *filter(None, (note,)), *problems)))
         if request.window is not None:
-            self._tell(request.window, request, None)
+            hulls = self.outlines(request.camera)
+            self._tell(request.window, hulls, None, ())
             self.on_shown(request.camera)
             if stage in ("draft", "full quality") and request.left != request.right and not self._worker.superseded:
                 left = self._picture(
                     replace(request, draft=request.draft and request.left in NEEDS_LIGHT), request.left, []
                 )
                 if not self._worker.superseded:
-                    self._tell(request.window, request, left.pixels)
+                    self._tell(request.window, hulls, left.pixels, (request.left, request.right))
 
     def _picture(self, request: PictureRequest, kind: PictureKind, problems: list[str]) -> Picture:
         """One picture; a grey one where it could not be drawn, and the reason is appended to `problems`."""
@@ -349,27 +356,30 @@ class PreviewPanel:
             return Picture(np.full((request.camera.height, request.camera.width, 3), 48, np.uint8))
 
     def _tell(
-        self, window: viser.ClientHandle, request: PictureRequest, before: UInt8[np.ndarray, "h w 3"] | None
+        self,
+        window: viser.ClientHandle,
+        hulls: list[list[Point2]],
+        before: UInt8[np.ndarray, "h w 3"] | None,
+        kinds: tuple[PictureKind, ...],
     ) -> None:
         """Tell the page's script of a window what its canvas shows: what can be grabbed, and the picture before."""
-        state: dict[str, object] = {"window": window.client_id, "hulls": self.outlines(request.camera)}
+        state: dict[str, object] = {"window": window.client_id, "hulls": hulls}
         if before is not None:
-            names = [_NAMES.get(kind, kind.lower()) for kind in (request.left, request.right)]
-            state |= {
-                "before": f"data:image/jpeg;base64,{base64.b64encode(jpeg(before, _BEFORE_QUALITY)).decode()}",
-                "names": names,
-            }
+            encoded = base64.b64encode(jpeg(before, _BEFORE_QUALITY)).decode()
+            names = [_NAMES.get(kind, kind.lower()) for kind in kinds]
+            state |= {"before": f"data:image/jpeg;base64,{encoded}", "names": names}
         self._version += 1
         text = html.escape(json.dumps(state))
         content = f'<div class="sg-state" data-version="{self._version}" style="display:none">{text}</div>'
-        if self._told is None or self._told[0] != window.client_id:
-            self._told = (window.client_id, window.gui.add_html(content))
-        else:
+        if self._told is None or self._told[0].client_id != window.client_id:
+            self._told = (window, window.gui.add_html(content))
+        elif window.client_id in self._context.server.get_clients():
             self._told[1].content = content
 
     def _described(self, request: PictureRequest) -> list[str]:
         """What the caption says of the picture."""
-        session, shown, found = request.session, request.right, [request.right]
+        session, shown = request.session, request.right
+        found = []
         if shown == "Light transfer" and not session.files.transfers_light:
             found.append(session.relighting.light_mode_note())
         if shown == "Photograph" and session.files.without_photos[1]:

@@ -16,6 +16,8 @@ _MAX_RATIO = 20
 """Unpacked over packed bytes; photos are compressed already, and masks are small."""
 _SMALL = 256 << 20
 """Bytes up to which the ratio does not matter."""
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Of the others zipfile unpacks each part that it reads whole, which may be thousands of times as large."""
 
 
 def is_archive(path: Path) -> bool:
@@ -73,6 +75,8 @@ def _opened(archive: Path) -> Iterator[tuple[zipfile.ZipFile, list[tuple[zipfile
             size = sum(one.file_size for one, _ in members)
             if len(members) > _MAX_FILES or size > max(_SMALL, min(_MAX_BYTES, _MAX_RATIO * archive.stat().st_size)):
                 raise ValueError(f"{expected} one that unpacks to {len(members)} files of {size / 1e9:.1f} GB")
+            if any(one.compress_type not in _METHODS for one, _ in members):
+                raise ValueError(f"{expected} one that is not deflated or stored")
             if not members:
                 raise ValueError(f"{expected} no photo in it")
             yield opened, members

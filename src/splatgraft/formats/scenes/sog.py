@@ -48,6 +48,14 @@ _MAX_PIXELS_PER_BYTE = 100
 """Largest picture that its bytes can hold: random bytes have 0.3, a scene of few different Gaussians 50; smaller
 pictures may have more."""
 _FREE_PIXELS = 1 << 20
+_MAX_META_BYTES = 1 << 24
+"""Of meta.json, which has some 20 kB."""
+_MAX_EXPANSION = 10
+"""Bytes of a file over those in the zip; pictures are compressed already."""
+_FREE_BYTES = 1 << 20
+"""Files below this size may expand further."""
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""The others are unpacked whole, whatever size the zip states."""
 _MAX_LOG_POSITION = 60.0
 _CODES = 256
 _SCALAR_ROUNDS = 100
@@ -126,8 +134,14 @@ def read_sog(path: Path) -> SceneFile:
 def _load(path: Path, name: str) -> bytes:
     """The bytes of a file of the scene."""
     if path.is_file() and path.name.lower() != _META_FILE:
-        with zipfile.ZipFile(path) as archive:
-            return archive.read(name)
+        with zipfile.ZipFile(path) as archive, archive.open(name) as stream:
+            entry = archive.getinfo(name)
+            most = _MAX_META_BYTES if name == _META_FILE else _MAX_EXPANSION * entry.compress_size
+            if entry.file_size > max(_FREE_BYTES, most) or entry.compress_type not in _METHODS:
+                found = f"{entry.file_size} bytes in {entry.compress_size}, method {entry.compress_type}"
+                raise ValueError(f"{path}: expected {name} of a scene, deflated or stored, found {found}")
+            # read() unpacks without regard to the size that the zip states
+            return stream.read(entry.file_size)
     if Path(name).name != name or "\\" in name:
         raise ValueError(f"{path}: expected plain file names in {_META_FILE}, found {name[:60]!r}")
     return ((path if path.is_dir() else path.parent) / name).read_bytes()
