@@ -82,18 +82,19 @@ def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window
     assert first.std() > 5
     # of 255 levels: JPEG, resampling, and rounding to the size of the canvas
     window.until(lambda: difference(window, first) < 3, what="the picture on the canvas")
-    window.drag((450, 700), (150, 40))
-    window.until(lambda: difference(window, first) > 6, what="another view")
+    # beside the object, which would be dragged
+    window.drag((150, 780), (150, 40))
+    camera, begun = page.context.guarded.editing().camera, page.context.cameras()[0].centers[0].numpy()
+    window.until(lambda: float(np.abs(camera.position - begun).max()) > 0.2, what="another view")
     second = picture_of(window)
     window.until(lambda: difference(window, second) < 3, what="the picture of the new view")
     # F turns to the object, Home goes back to the first view
-    camera, session = page.context.guarded.editing().camera, page.context.require_session()
+    session = page.context.require_session()
     placed = session.objects()[0].target_from_object.gaussians(session.placeable_object(0).gaussians)
     middle = bounding_sphere(placed).center.numpy()
     window.page.keyboard.press("f")
     window.until(lambda: float(np.abs(camera.look_at - middle).max()) < 1e-3, what="the view turned to the object")
     window.page.keyboard.press("Home")
-    begun = page.context.cameras()[0].centers[0].numpy()
     window.until(lambda: float(np.abs(camera.position - begun).max()) < 1e-3, what="the first view again")
     # no key flies the camera
     for key in ("w", "a", "s", "d", "q", "e"):
