@@ -66,12 +66,14 @@ def ball() -> Gaussians:
     return blobs(0.25 * points + torch.tensor([0, 0, 0.3]), (0.8, 0.2, 0.1), 0.07)
 
 
-def photograph(folder: Path, scene: Gaussians, object_: Gaussians | None, around_deg: float = 360.0) -> None:
-    """A capture of `scene` by 8 cameras of 48x36 pixels, with masks of `object_` where there is one."""
+def photograph(
+    folder: Path, scene: Gaussians, object_: Gaussians | None, around_deg: float = 360.0, *, width: int = 48
+) -> None:
+    """A capture of `scene` by 8 cameras of 48x36 pixels or larger, with masks of `object_` where there is one."""
     angles = torch.arange(8) * math.radians(around_deg / 8)
     eyes = torch.stack([1.6 * angles.cos(), 1.6 * angles.sin(), torch.full((8,), 1.0)], 1)
     poses = look_at(eyes, torch.tensor([0.0, 0, 0.15]), torch.tensor([0.0, 0, 1]))
-    cameras = pinhole(poses, 45.0, width=48, height=36)
+    cameras = pinhole(poses, 45.0 / 48 * width, width=width, height=36 * width // 48)
     whole = scene if object_ is None else concatenate([scene, object_])
     pictures = render(whole, cameras, features=(torch.arange(whole.count) >= scene.count)[:, None].float())
     for name in ("images", "masks") if object_ is not None else ("images",):
