@@ -188,7 +188,10 @@ class Client:
 
 
 def is_picture(message: dict[str, Any]) -> bool:
-    return message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None
+    # one without depth is the last picture, behind the splats of a moving view
+    return (
+        message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None and bool(message["depth_data"])
+    )
 
 
 def is_final(client: Client) -> bool:

@@ -344,12 +344,12 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
         assert mark_of(page, "Run") == "\u2713"
         session.change(replace(session.state, weights=LayerWeights(shadow=0.5)))
         page.refresh()
-        assert "The result is out of date: relight: " in share._stale.content
+        assert "The result is out of date: you changed the light" in share._stale.content
         assert mark_of(page, "Run") == "\u21bb"
         sends(share._kind, "Scene, exact (.ply)")
         is_handled(share._write)
         wait_until(lambda: share._bar.visible, what="the progress of the export")
-        wait_until(lambda: "it is out of date (relight: " in status(page), what="the end of the export")
+        wait_until(lambda: "it is out of date (you changed the light" in status(page), what="the end of the export")
         assert session.jobs._child is not None
         session.jobs._child.wait()
         assert " MB in " in status(page)

@@ -193,7 +193,7 @@ def with_badge(pixels: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarra
     out = np.ascontiguousarray(pixels.copy())
     size = max(0.4, pixels.shape[1] / 2400)
     (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
-    x, y = round(12 * size) + 4, pixels.shape[0] - round(14 * size) - 4
+    x, y = round(12 * size) + 24, pixels.shape[0] - round(14 * size) - 4
     corner, end = (x - 6, y - height - 6), (x + width + 6, y + base + 2)
     patch = out[max(0, corner[1]) : end[1], max(0, corner[0]) : end[0]]
     patch[:] = patch // 3

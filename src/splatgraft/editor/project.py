@@ -3,7 +3,7 @@
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
@@ -26,7 +26,7 @@ from splatgraft.project.layout import (
     Side,
 )
 from splatgraft.project.toml_edit import with_keys
-from splatgraft.relighting import RelightOptions
+from splatgraft.relighting import LayerWeights, RelightOptions
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
 from splatgraft.workflow.flow import Flow, read_flow, reasons
@@ -189,6 +189,7 @@ def _rendered_views(flow: Flow, side: Side) -> RenderedViews:
     return RenderedViews(step.look.up, step.look.look == "within") if isinstance(step, Capture) else RenderedViews()
 
 
+_WEIGHTS = tuple(field.name for field in fields(LayerWeights))
 _EDITS = {
     "placement.json": "you moved the object",
     "erased.npy": "you erased part of the place",
@@ -203,6 +204,8 @@ def in_words(step: str, reason: str) -> str:
     # `compose` finds a place from the cameras until there is one by hand
     if step == "compose" and reason.partition(":")[0] in ("cameras", "placement"):
         return _EDITS["placement.json"]
+    if step == "relight" and reason.partition(" is now ")[0] in _WEIGHTS:
+        return _EDITS["light.json"]
     if reason.startswith("waits for "):
         return f"after {reason.removeprefix('waits for ')}"
     return next((words for file, words in _EDITS.items() if f": {file} changed" in reason), reason)

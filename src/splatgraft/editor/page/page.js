@@ -43,7 +43,7 @@
     line.setAttribute("aria-valuenow", Math.round(100 * split));
     const shown = isWhole ? 1 : split;
     names[0].hidden = !isThere || shown < 0.02;
-    names[1].hidden = !isThere || shown === 0 || shown > 0.98;
+    names[1].hidden = !isThere || shown < 0.02 || shown > 0.98;
     [names[0].textContent, names[1].textContent] = state.names || ["", ""];
     tools.hidden = !state.hulls.length;
     for (const button of tools.children) button.setAttribute("aria-pressed", String(button.dataset.mode === mode));

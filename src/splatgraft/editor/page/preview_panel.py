@@ -49,7 +49,12 @@ _NO_WINDOW_WIDTH, _MAX_WIDTH, _SAVED_WIDTH = 480, 1920, 1280
 """Pixels of a picture that no window shows, of the largest one on the canvas, which the browser enlarges, of a file."""
 _BEFORE_QUALITY = 85
 """JPEG quality of the picture under the divider."""
-_NAMES: dict[PictureKind, str] = {"Source": "photo", "Selection": "selected"}
+_NAMES: dict[PictureKind, str] = {
+    "Copy-paste": "pasted",
+    "Light transfer": "with its new light",
+    "Source": "photo",
+    "Selection": "selected",
+}
 """What the divider calls its two pictures, where that is not the name of their kind."""
 
 
@@ -384,7 +389,8 @@ class PreviewPanel:
             found.append(session.relighting.light_mode_note())
         if shown == "Photograph" and session.files.without_photos[1]:
             found.append("no photograph: an image rendered of the scene, which has no photographs")
-        why = session.why_stale("consolidate") if shown == "Result" and session.files.result.is_file() else None
+        is_shown = shown == "Result" and session.files.result.is_file() and self._context.phase != "Run"
+        why = session.why_stale("consolidate") if is_shown else None
         if why is not None:
             found.append(f"<b>the result is out of date</b> ({html.escape(why)}): see Run")
         return found

@@ -52,6 +52,9 @@ class RunPhase(Phase):
             self.enter()
 
     def _said(self, session: Session) -> str:
+        job = session.jobs.state()
+        if job is not None and job.live:
+            return "A result is being made; you can go on meanwhile."
         why = session.why_stale(self._last_step())
         if not session.files.result.is_file():
             return "There is no result yet."
