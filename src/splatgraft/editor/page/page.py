@@ -33,7 +33,8 @@ _CURRENT, _DONE, _STALE, _NEXT = "\u25cf ", "\u2713 ", "\u21bb ", "\u203a "
 """What stands before the name of a phase: the shown one, and others that are done, out of date, or to be done next."""
 _CSS = """<style>
 div:has(> * > label[for="{steps}"]) {{ display: none; }}
-div:has(> * > * > label[for="{steps}"]) button {{ padding: 0 5px; }}
+div:has(> * > * > label[for="{steps}"]) button {{ padding: 0 2px; }}
+div:has(> * > * > label[for="{steps}"]) div:has(> button) {{ gap: .2em !important; }}
 </style>"""
 """The label of the steps is hidden, so that six buttons fit in one row."""
 _WATCH_NOTE = (
