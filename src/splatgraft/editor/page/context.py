@@ -266,6 +266,27 @@ class PageContext:
             self.refresh()
 
 
+class SceneClicks:
+    """Takes clicks on the scene while they are wanted."""
+
+    def __init__(self, context: PageContext, work: Callable[[viser.SceneClickEvent], object]) -> None:
+        """Take none yet; `work` gets each of them."""
+        self._scene, self._call = context.server.scene, context.callback(work)
+        self.is_listening = False
+        """Whether clicks are taken."""
+
+    def listen(self, wanted: bool) -> None:
+        """Take clicks from now on, or no more."""
+        if wanted and not self.is_listening:
+            self._scene.on_click()(self._clicked)
+        elif self.is_listening and not wanted:
+            self._scene.remove_click_callback(self._clicked)
+        self.is_listening = wanted
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        self._call(event)
+
+
 class Phase:
     """One phase of the editing workflow: its controls and its part of the 3D view."""
 

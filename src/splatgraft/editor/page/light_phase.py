@@ -16,7 +16,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.directions import tangents
-from splatgraft.editor.page.context import PageContext, Phase, note
+from splatgraft.editor.page.context import PageContext, Phase, SceneClicks, note
 from splatgraft.editor.page.handles import add_handle
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.page.scene_view import camera_from_viser, ray_from_viser
@@ -299,13 +299,13 @@ class SunClicks:
         self._points: tuple[Point, ...] = ()
         self._set_light: Light | None = None
         """The light when the last point was added; under another one, as after undo, pairs begin anew."""
-        self._is_listening = False
+        self._clicks = SceneClicks(context, self._add)
 
     def refresh(self, light: Light | None) -> None:
         """Take clicks while it is active and there is a light, and show the points."""
         self._is_active.visible = light is not None
-        self._listen(self._is_active.value and light is not None)
-        points, scene = self._kept() if self._is_listening else (), self._context.server.scene
+        self._clicks.listen(self._is_active.value and light is not None)
+        points, scene = self._kept() if self._clicks.is_listening else (), self._context.server.scene
         for name in ("points", "pairs"):
             self._context.view.remove(f"/light/{name}")
         if points:
@@ -323,20 +323,10 @@ class SunClicks:
         """The points that still hold."""
         return self._points if self._context.require_session().state.light is self._set_light else ()
 
-    def _listen(self, wanted: bool) -> None:
-        if wanted and not self._is_listening:
-            self._context.server.scene.on_click()(self._clicked)
-        elif self._is_listening and not wanted:
-            self._context.server.scene.remove_click_callback(self._clicked)
-        self._is_listening = wanted
-
     def _toggle(self) -> None:
-        self._listen(self._is_active.value)
+        self._clicks.listen(self._is_active.value)
         if self._is_active.value:
             self._context.say("click what casts a shadow in the scene, such as the corner of a table")
-
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
-        self._context.callback(self._add)(event)
 
     def _add(self, event: viser.SceneClickEvent) -> None:
         session, ray = self._context.require_session(), ray_from_viser(event)

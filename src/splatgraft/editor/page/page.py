@@ -247,6 +247,8 @@ class Page:
             for number, window in watching.items():
                 if number not in self._notices:
                     self._notices[number] = window.gui.add_html(note(_WATCH_NOTE, kind="watch"), order=-1.0)
+        if (editing := self.context.guarded.editing()) is not None:
+            self.preview.introduce(editing)
         self.preview.update()
 
     def _save_view(self, scene: str) -> None:

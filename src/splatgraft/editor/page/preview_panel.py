@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -136,6 +137,7 @@ class PreviewPanel:
         self._told: tuple[viser.ClientHandle, viser.GuiHtmlHandle] | None = None
         """The window whose script was told of its picture, and where."""
         self._version = 0
+        self._telling = threading.Lock()
         self.light_ready: Callable[[], None] = lambda: None
         """Called after the light has been estimated."""
         self.on_shown: Callable[[Cameras], None] = lambda camera: None
@@ -176,6 +178,11 @@ class PreviewPanel:
         if self._told is not None:
             self._tell(self._told[0], [], None, ())
         self._show_cameras()
+
+    def introduce(self, window: viser.ClientHandle) -> None:
+        """Tell the script of the window that edits its number, before there is any picture."""
+        if self._told is None or self._told[0].client_id != window.client_id:
+            self._tell(window, [], None, ())
 
     def set_dragged_state(self, state: EditState | None) -> None:
         """Show `state` during a drag; None: show the saved state."""
@@ -373,13 +380,14 @@ class PreviewPanel:
             encoded = base64.b64encode(jpeg(before, _BEFORE_QUALITY)).decode()
             names = [_NAMES.get(kind, kind.lower()) for kind in kinds]
             state |= {"before": f"data:image/jpeg;base64,{encoded}", "names": names}
-        self._version += 1
-        text = html.escape(json.dumps(state))
-        content = f'<div class="sg-state" data-version="{self._version}" style="display:none">{text}</div>'
-        if self._told is None or self._told[0].client_id != window.client_id:
-            self._told = (window, window.gui.add_html(content))
-        elif window.client_id in self._context.server.get_clients():
-            self._told[1].content = content
+        with self._telling:
+            self._version += 1
+            text = html.escape(json.dumps(state))
+            content = f'<div class="sg-state" data-version="{self._version}" style="display:none">{text}</div>'
+            if self._told is None or self._told[0].client_id != window.client_id:
+                self._told = (window, window.gui.add_html(content))
+            elif window.client_id in self._context.server.get_clients():
+                self._told[1].content = content
 
     def _described(self, request: PictureRequest) -> list[str]:
         """What the caption says of the picture."""

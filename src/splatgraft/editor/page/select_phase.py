@@ -10,7 +10,7 @@ import viser
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.editor.page.context import PageContext, Phase, note
+from splatgraft.editor.page.context import PageContext, Phase, SceneClicks, note
 from splatgraft.editor.page.handles import BoxHandles
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.page.scene_view import Color, camera_from_viser, ray_from_viser
@@ -81,7 +81,7 @@ class SelectPhase(Phase):
         self._shown_box: BoxNumbers | None = None
         """What the fields of the box show. They are written only where the state has something else: the value of a
         refresh would arrive while the next number is typed, and replace it."""
-        self._is_listening = False
+        self._clicks = SceneClicks(context, self._mark)
         context.on(self._photo, lambda: preview.to_camera(int(self._photo.value) - 1))
         context.on(self._source, lambda: self._set(mask_source=_SOURCES[self._source.value]))
         context.on(self._lower, self._box_typed)
@@ -102,7 +102,7 @@ class SelectPhase(Phase):
         """Hide what belongs to the phase alone."""
         self._context.server.scene.remove_rect_select_callback(self._rectangle_drawn)
         self._brush.deactivate()
-        self._listen(False)
+        self._clicks.listen(False)
         self._handles.hide()
         self._correction_handles.hide()
 
@@ -140,7 +140,7 @@ class SelectPhase(Phase):
             self._brush.activate(session.scenes.gaussians(session.files.source_scene), size=float(self._size.value))
         else:
             self._brush.deactivate()
-        self._listen(not self._use_brush.value)
+        self._clicks.listen(not self._use_brush.value)
 
     def view_shown(self) -> None:
         """Show which photo the view stands at, once it rests."""
@@ -157,16 +157,6 @@ class SelectPhase(Phase):
         self._preview.is_object_alone = self._isolate.value
 
     # clicks
-
-    def _listen(self, wanted: bool) -> None:
-        if wanted and not self._is_listening:
-            self._context.server.scene.on_click()(self._clicked)
-        elif self._is_listening and not wanted:
-            self._context.server.scene.remove_click_callback(self._clicked)
-        self._is_listening = wanted
-
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
-        self._context.callback(self._mark)(event)
 
     def _mark(self, event: viser.SceneClickEvent) -> None:
         """Add a point to the photo from whose place the scene is seen, else to the one that sees it most alike."""

@@ -79,6 +79,8 @@ class GuardedServer:
         self._connections = 0
         # of what a client sends, which it quotes
         warnings.filterwarnings("ignore", r"\[viser\]")
+        # a window may close while something is on its way to it
+        warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection")
         # viser has no hook for requests: websockets.serve is replaced while viser starts
         original = websockets.asyncio.server.serve
         websockets.asyncio.server.serve = partial(self._serve, original)  # pyright: ignore
