@@ -688,7 +688,13 @@ def place(window: Window, browser: Any, editor: Editor, project: Path) -> Window
     window.page.close()
     window = Window.opened(browser, editor.url)
     window.show_phase("Place")
-    window.page.keyboard.press("f")
+
+    def is_in_the_middle() -> bool:
+        hulls = told(window)["hulls"]
+        return bool(hulls) and bool((abs(np.array(hulls[0]).mean(0) - 0.5) < 0.2).all())
+
+    # a page that has just opened may not hear a key yet
+    window.act_until(lambda: window.page.keyboard.press("f"), is_in_the_middle, what="the object in the middle")
     wait_for_the_full_light(window)
     before = object_at(project)
 

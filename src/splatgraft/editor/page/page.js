@@ -2,7 +2,7 @@
 // What viser's page has no control for: hands on the object, the divider between two pictures, lights that are dragged on
 // the picture of the sky, and the word that the editor has ended. `page_script.py` says what the server sends and takes.
 (() => {
-  const CLICK_PX = 4, STALE_MS = 1500, ALIVE_MS = 2000, SWAP_MS = 200;
+  const CLICK_PX = 4, STALE_MS = 1500, ALIVE_MS = 2000, SWAP_MS = 200, DECODE_MS = 300, HELD_MS = 8000;
   const FLY = new Set(["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"]);
   const MODES = { move: ["Move", "W"], turn: ["Turn", "R"], size: ["Size", "S"], lift: ["Lift", "E"] };
   const KEYS = { KeyW: "move", KeyR: "turn", KeyS: "size", KeyE: "lift" };
@@ -13,6 +13,7 @@
     '<span class="sg-name" style="left:12px" hidden></span><span class="sg-name" style="right:12px" hidden></span>' +
     `<div id="sg-tools" hidden>${Object.entries(MODES).map(([mode, [name, key]]) =>
       `<button data-mode="${mode}">${name}<kbd>${key}</kbd></button>`).join("")}</div>`;
+  const pause = (ms) => new Promise((done) => setTimeout(done, ms));
   const part = (selector) => over.querySelector(selector);
   const before = part(".sg-before"), dragged = part(".sg-drag"), line = part(".sg-line"), tools = part("#sg-tools");
   const names = over.querySelectorAll(".sg-name");
@@ -31,7 +32,7 @@
     isMoving = false;
     if (state.before) before.src = state.before;
     // the canvas takes a moment to show the picture that the state came with
-    if (!grab) setTimeout(() => { if (!grab) dragged.hidden = true; }, SWAP_MS);
+    if (!grab) hideDragged();
     show();
   }
 
@@ -47,6 +48,14 @@
     [names[0].textContent, names[1].textContent] = state.names || ["", ""];
     tools.hidden = !state.hulls.length;
     for (const button of tools.children) button.setAttribute("aria-pressed", String(button.dataset.mode === mode));
+  }
+
+  function hideDragged() {
+    setTimeout(() => {
+      if (grab) return;
+      dragged.hidden = true;
+      show();
+    }, SWAP_MS);
   }
 
   function setMode(wanted) {
@@ -95,18 +104,25 @@
           const url = URL.createObjectURL(await answer.blob());
           const old = dragged.src;
           dragged.src = url;
-          await dragged.decode().catch(() => undefined);
+          // a browser may put off decoding for a page that is not seen
+          await Promise.race([dragged.decode().catch(() => undefined), pause(DECODE_MS)]);
           if (old) URL.revokeObjectURL(old);
           dragged.hidden = false;
           show();
         }
       }
-      if (held.end) await ask(held.end, held.at);
+      if (held.end) {
+        held.version = state.version;
+        await ask(held.end, held.at);
+      }
     } finally {
       held.isBusy = false;
       if (held.end && grab === held) {
         grab = null;
         if (held.end === "cancel" || !held.hasMoved) dragged.hidden = true;
+        // the picture with the object at its new place may have come before the answer
+        else if (state.version !== held.version) hideDragged();
+        else setTimeout(hideDragged, HELD_MS);
         setMode("move");
       }
     }

@@ -60,6 +60,8 @@ _MAX_UPLOADS = 8
 """Most uploads under way."""
 _MAX_WINDOWS = 16
 """Most windows at once: each gets a copy of the scene of its own."""
+_ANSWER_SECONDS = 60
+"""Limit of an answer to the page's script, which may wait for a picture: to websockets it is part of a handshake."""
 _PROBE_SECONDS = 300
 """Limit of the request to the own server at the start: against a hang, not for a busy machine."""
 
@@ -131,7 +133,7 @@ class GuardedServer:
 
     def _serve(self, original: Callable[..., Any], handler: Callable[..., Any], *args: Any, **options: Any) -> Any:
         answer = partial(self._answer, options["process_request"])
-        options |= {"process_request": answer, "max_size": _MAX_MESSAGE_BYTES}
+        options |= {"process_request": answer, "max_size": _MAX_MESSAGE_BYTES, "open_timeout": _ANSWER_SECONDS}
         return original(partial(self._attend, handler), *args, **options)
 
     async def _attend(self, handler: Callable[..., Any], connection: Any) -> None:
