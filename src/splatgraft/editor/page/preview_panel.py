@@ -6,7 +6,7 @@ import json
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -181,8 +181,10 @@ class PreviewPanel:
 
     def introduce(self, window: viser.ClientHandle) -> None:
         """Tell the script of the window that edits its number, before there is any picture."""
-        if self._told is None or self._told[0].client_id != window.client_id:
-            self._tell(window, [], None, ())
+        with self._telling:
+            # a picture may have come first
+            if self._told is None or self._told[0].client_id != window.client_id:
+                self._write(window, {"window": window.client_id, "hulls": []})
 
     def set_dragged_state(self, state: EditState | None) -> None:
         """Show `state` during a drag; None: show the saved state."""
@@ -381,13 +383,16 @@ class PreviewPanel:
             names = [_NAMES.get(kind, kind.lower()) for kind in kinds]
             state |= {"before": f"data:image/jpeg;base64,{encoded}", "names": names}
         with self._telling:
-            self._version += 1
-            text = html.escape(json.dumps(state))
-            content = f'<div class="sg-state" data-version="{self._version}" style="display:none">{text}</div>'
-            if self._told is None or self._told[0].client_id != window.client_id:
-                self._told = (window, window.gui.add_html(content))
-            elif window.client_id in self._context.server.get_clients():
-                self._told[1].content = content
+            self._write(window, state)
+
+    def _write(self, window: viser.ClientHandle, state: Mapping[str, object]) -> None:
+        self._version += 1
+        text = html.escape(json.dumps(state))
+        content = f'<div class="sg-state" data-version="{self._version}" style="display:none">{text}</div>'
+        if self._told is None or self._told[0].client_id != window.client_id:
+            self._told = (window, window.gui.add_html(content))
+        elif window.client_id in self._context.server.get_clients():
+            self._told[1].content = content
 
     def _described(self, request: PictureRequest) -> list[str]:
         """What the caption says of the picture."""
