@@ -122,10 +122,16 @@ def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window
     notice = "another window edits this project"
     other.says(notice)
     assert window.page.get_by_text(notice).count() == 0
+    closed = page.context.guarded.editing()
+    assert closed is not None
     window.page.close()
     other.page.get_by_text(notice).wait_for(state="detached")
     other.show_phase("Run")
     other.says("There is no result yet")
+    # a picture that is drawn late for the closed window leaves the script of the other one what it is told
+    page.preview._tell(closed, [], None, ())
+    other.show_phase("Place")
+    other.until(lambda: bool(told(other)["hulls"]), what="the outline of the object")
     assert window.unknown_errors() == other.unknown_errors() == []
     other.page.close()
 

@@ -97,14 +97,7 @@ class PictureRequest:
         best_draft = self.session.relighting.best(state) if self.draft else None
         selection = self.session.selection() if self.is_of_source else None
         prompts = state.prompts if self.is_of_source else None
-        drawn = (
-            _pose(self.camera),
-            self.draft,
-            best_draft,
-            self.budget or 0,
-            stamp,
-            -1 if self.photo is None else self.photo,
-        )
+        drawn = (_pose(self.camera), self.photo, self.draft, best_draft, self.budget, stamp)
         return (*drawn, state.objects, state.erased, state.light, state.weights, selection, prompts)
 
     def draw(self, kind: PictureKind) -> Picture:
@@ -134,8 +127,8 @@ class PreviewPanel:
         self._canvas_size: tuple[float, int] = (0.0, 0)
         self._is_on_canvas = False
         """Whether the newest request is for the canvas."""
-        self._told: tuple[viser.ClientHandle, viser.GuiHtmlHandle] | None = None
-        """The window whose script was told of its picture, and where."""
+        self._told: dict[int, viser.GuiHtmlHandle] = {}
+        """Where the script of a window is told of its picture: one place for each, however late a picture is drawn."""
         self._version = 0
         self._telling = threading.Lock()
         self.light_ready: Callable[[], None] = lambda: None
@@ -175,15 +168,15 @@ class PreviewPanel:
         self._drawn = Memo()
         self._is_on_canvas = False
         self.canvas.clear()
-        if self._told is not None:
-            self._tell(self._told[0], [], None, ())
+        if (window := self._context.guarded.editing()) is not None:
+            self._tell(window, [], None, ())
         self._show_cameras()
 
     def introduce(self, window: viser.ClientHandle) -> None:
         """Tell the script of the window that edits its number, before there is any picture."""
         with self._telling:
             # a picture may have come first
-            if self._told is None or self._told[0].client_id != window.client_id:
+            if window.client_id not in self._told:
                 self._write(window, {"window": window.client_id, "hulls": []})
 
     def set_dragged_state(self, state: EditState | None) -> None:
@@ -386,13 +379,16 @@ class PreviewPanel:
             self._write(window, state)
 
     def _write(self, window: viser.ClientHandle, state: Mapping[str, object]) -> None:
+        if window.client_id not in self._context.server.get_clients():
+            self._told.pop(window.client_id, None)
+            return
         self._version += 1
         text = html.escape(json.dumps(state))
         content = f'<div class="sg-state" data-version="{self._version}" style="display:none">{text}</div>'
-        if self._told is None or self._told[0].client_id != window.client_id:
-            self._told = (window, window.gui.add_html(content))
-        elif window.client_id in self._context.server.get_clients():
-            self._told[1].content = content
+        if window.client_id in self._told:
+            self._told[window.client_id].content = content
+        else:
+            self._told[window.client_id] = window.gui.add_html(content)
 
     def _described(self, request: PictureRequest) -> list[str]:
         """What the caption says of the picture."""
