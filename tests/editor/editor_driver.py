@@ -35,8 +35,6 @@ ARGUMENTS = (
 KNOWN_ERRORS = (
     # viser draws splats on a quad whose corners have no z, so that three.js finds no bounding sphere
     "Computed radius is NaN",
-    # the address of the panel's picture: viser's Image.tsx takes it back when the next one comes, read or not
-    "net::ERR_FILE_NOT_FOUND",
     # the controls of three.js, on a touch or a wheel
     "Unable to preventDefault inside passive event listener",
 )

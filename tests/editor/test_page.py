@@ -154,6 +154,10 @@ def test_the_strength_of_a_source_stays_as_it_was_set(page: Page) -> None:
     sends(light._strength, 0.5)
     assert session.state.light.sources[0].irradiance == pytest.approx((1.0, 1.0, 1.0))
     assert session.state.light.sources[1] == suns[1]
+    # nor does another change of it begin anew
+    sends(light._softness, 5.0)
+    assert light._strength.value == 0.5
+    assert session.state.light.sources[0].angular_radius_deg == 5.0
     sends(light._source_choice, "2: lamp")
     assert light._strength.value == 1
 
@@ -341,11 +345,11 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
         assert "The result is up to date" in run._note.content
         share = phase_of(page, "Share")
         assert not share._stale.visible
-        assert mark_of(page, "Run") == "\u2713"
+        wait_until(lambda: mark_of(page, "Run") == "\u2713", what="the mark of what is done")
         session.change(replace(session.state, weights=LayerWeights(shadow=0.5)))
         page.refresh()
         assert "The result is out of date: you changed the light" in share._stale.content
-        assert mark_of(page, "Run") == "\u21bb"
+        wait_until(lambda: mark_of(page, "Run") == "\u21bb", what="the mark of what is out of date")
         sends(share._kind, "Scene, exact (.ply)")
         is_handled(share._write)
         wait_until(lambda: share._bar.visible, what="the progress of the export")

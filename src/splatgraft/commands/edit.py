@@ -30,7 +30,7 @@ class Edit:
     keep_closed: bool = False
     """Only print the address, where there is a desktop to open it on."""
     budget: int = 300_000
-    """Maximum number of Gaussians per scene that the browser shows; files keep all."""
+    """Most Gaussians of a scene that are drawn while the view moves; resting pictures and files have all."""
 
     def execute(self, console: Console) -> int:
         """Serve until Ctrl-C."""

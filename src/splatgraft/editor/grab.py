@@ -38,6 +38,7 @@ class Grab:
     """An object as it was when it was grabbed, and the view in which it is dragged."""
 
     item: PlaceableObject
+    """The object, in the frame of its own capture."""
     placed: Similarity
     """Its placement at the start."""
     camera: Cameras

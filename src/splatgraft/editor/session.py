@@ -249,12 +249,12 @@ class Session:
         """Start a child process that runs a command, which is given by the words after `splatgraft`."""
         self.jobs.start(self.project.job_command(words, title), title=title, shown=words)
 
-    def why_stale(self, step: str) -> str | None:
-        """Why the result of a step is out of date, with the first step that is; None where it is up to date."""
+    def why_stale(self, *steps: str) -> str | None:
+        """Why the result of one of these steps is out of date, with the first step that is; None where none is."""
         found = self.project.reasons()
-        if step not in found:
-            return found.get(PROBLEM)
-        name, reason = step, found[step]
+        if PROBLEM in found:
+            return found[PROBLEM]
+        name, reason = next(((step, found[step]) for step in steps if found.get(step) is not None), ("", None))
         while reason is not None and (before := reason.removeprefix("waits for ")) in found and before != reason:
             name, reason = before, found[before]
         if reason is None:

@@ -13,6 +13,7 @@ import viser
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
+from splatgraft.editor.jobs import JobState
 from splatgraft.editor.page.opening import View, look_through, typical_distance
 from splatgraft.editor.page.scene_view import SceneView
 from splatgraft.editor.page.server import GuardedServer
@@ -59,8 +60,6 @@ class PageContext:
         self.reopened: Callable[[], None] = lambda: None
         """Shows another project, after `open_project`."""
         self.on_close: list[Callable[[], None]] = []
-        self.on_moved: list[Callable[[], None]] = []
-        """Called when the view or the shape of the editing window has changed."""
         self.status = self.gui.add_html("", order=STATUS_ORDER)
         self.more = self.gui.add_folder("More", order=MORE_ORDER, expand_by_default=False)
         """Holds what a phase does not show at first."""
@@ -299,3 +298,9 @@ class Phase:
     def refresh(self) -> None:
         """Update controls and 3D view to the current state."""
         raise NotImplementedError
+
+    def view_shown(self, camera: Cameras) -> None:
+        """Update what depends on the view, after a picture of it was put on the canvas."""
+
+    def job_ended(self, job: JobState) -> None:
+        """Update what depends on a job that has ended; called for all phases."""

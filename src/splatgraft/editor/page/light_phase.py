@@ -19,7 +19,7 @@ from splatgraft.core.directions import tangents
 from splatgraft.editor.page.context import PageContext, Phase, SceneClicks, note
 from splatgraft.editor.page.handles import add_handle
 from splatgraft.editor.page.preview_panel import PreviewPanel
-from splatgraft.editor.page.scene_view import camera_from_viser, ray_from_viser
+from splatgraft.editor.page.scene_view import direction_from_viser, ray_from_viser
 from splatgraft.editor.picking import first_surface_hit
 from splatgraft.editor.session import Session
 from splatgraft.editor.sky_dome import SkyDome
@@ -49,8 +49,6 @@ _UNSEEN = 0.5
 """Share of the directions overhead that were not photographed, from which on the panel says so."""
 _HANDLE_PX = 70.0
 """Length of the handle's arrows on the screen, pixels."""
-_NO_PIXELS = 100
-"""Width of a camera of which only the pose counts."""
 _RING_SEGMENTS = 48
 _MARK = (255, 200, 60)
 """Color of the points that set the sun."""
@@ -138,7 +136,7 @@ class LightPhase(Phase):
         self._draw(session, light)
 
     def view_shown(self, camera: Cameras) -> None:
-        """Turn the picture of the sky with the view, once it rests."""
+        """Turn the picture of the sky with the view."""
         session = self._context.session
         if session is None or not session.objects():
             return
@@ -152,7 +150,7 @@ class LightPhase(Phase):
         """The picture of the sky with its lights, and the same in words."""
         if self._dome is None:
             window = self._context.guarded.editing()
-            away = torch.tensor([0.0, 1.0, 0.0]) if window is None else _forward(window)
+            away = torch.tensor([0.0, 1.0, 0.0]) if window is None else direction_from_viser(window.camera)
             self._dome = SkyDome.seen_along(away, session.up())
         self._sky.content = self._dome.svg(light)
         named = [f"{s.name.partition(' set by hand')[0]} {self._dome.words(s)}" for s in light.sources[:_MAX_SOURCES]]
@@ -182,23 +180,24 @@ class LightPhase(Phase):
         return list(self._source_choice.options).index(self._source_choice.value)
 
     def _scale_source(self) -> None:
+        factor = float(self._strength.value)
+        r, g, b = (factor * value for value in self._full[self._index()])
+        self._change_source(lambda source: replace(source, irradiance=(r, g, b)))
+
+    def _soften(self) -> None:
+        degrees = float(self._softness.value)
+        self._change_source(lambda source: replace(source, angular_radius_deg=degrees, uncertainty_deg=0.0))
+
+    def _change_source(self, change: Callable[[LightSource], LightSource]) -> None:
+        """Change the chosen source; the strengths stay relative to what they were."""
         session = self._context.require_session()
         light = self._light(session) if session.objects() else None
         if light is None:
             return
-        index, factor = self._index(), float(self._strength.value)
-        r, g, b = (factor * value for value in self._full[index])
-        edited = _with_source(light, index, replace(light.sources[index], irradiance=(r, g, b)))
+        index = self._index()
+        edited = _with_source(light, index, change(light.sources[index]))
         self._scaled = edited.sources
         session.change(replace(session.placed_state(), light=edited))
-
-    def _soften(self) -> None:
-        session = self._context.require_session()
-        light = self._light(session) if session.objects() else None
-        if light is not None and light.sources:
-            index = min(self._index(), len(light.sources) - 1)
-            wide = replace(light.sources[index], angular_radius_deg=float(self._softness.value), uncertainty_deg=0.0)
-            session.change(replace(session.placed_state(), light=_with_source(light, index, wide)))
 
     def _drag_on_sky(self, query: Mapping[str, str]) -> None:
         """Move a light on the picture of the sky, to x and y over the horizon's radius."""
@@ -354,11 +353,6 @@ class SunClicks:
             "as the shadow's edge shows" if sun.ratio is not None else "estimated, as no edge of the shadow is seen"
         )
         self._context.say(f"the sun by {agree}; its strength is {strength}; another pair makes it more exact")
-
-
-def _forward(window: viser.ClientHandle) -> Float[Tensor, "3"]:
-    """Where a window looks."""
-    return camera_from_viser(window.camera, width=_NO_PIXELS).world_from_camera[0, :3, 2]
 
 
 def arrow_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "2 3"]:

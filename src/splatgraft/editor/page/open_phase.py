@@ -98,8 +98,7 @@ class OpenPhase(Phase):
         self._context.show_target()
         lines = [self._line(session, index) for index in range(len(_SIDES))]
         have_both = session.files.source_scene.is_file() and session.files.target_scene.is_file()
-        stale = (session.why_stale(f"{side}/reconstruct") for side, _ in _SIDES) if have_both else ()
-        why = next((found for found in stale if found is not None), None)
+        why = session.why_stale(*(f"{side}/reconstruct" for side, _ in _SIDES)) if have_both else None
         if why is not None:
             lines.append(f"Out of date: {html.escape(why)}")
         self._facts.content = note("<br>".join(lines))

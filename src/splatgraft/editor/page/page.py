@@ -26,8 +26,11 @@ from splatgraft.editor.page.share_phase import SharePhase
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
 from splatgraft.editor.sharing import served_file, written_exports
+from splatgraft.editor.worker import LatestOnlyWorker
 
 _POLL_SECONDS = 0.4
+_MARK_SECONDS = 1.0
+"""How long nothing must change before the phases are marked anew."""
 PHASES = ("Open", "Select", "Place", "Light", "Run", "Share")
 _CURRENT, _DONE, _STALE, _NEXT = "\u25cf ", "\u2713 ", "\u21bb ", "\u203a "
 """What stands before the name of a phase: the shown one, and others that are done, out of date, or to be done next."""
@@ -56,6 +59,9 @@ class Page:
         context.refresh, context.reopened = self.refresh, self._reopened
         gui = context.gui
         self._header = gui.add_html("")
+        self._marks: dict[str, str] = {}
+        self._marker = LatestOnlyWorker(self._find_marks, context.say_error)
+        context.on_close.append(self._marker.close)
         self._notices: dict[int, viser.GuiHtmlHandle] = {}
         # windows open and close in several threads; the context's lock may be held by one that waits for a window
         self._notices_lock = threading.Lock()
@@ -119,7 +125,8 @@ class Page:
             saved = "" if session is None else '<span class="sg-saved" style="opacity:.6;float:right">saved</span>'
             self._header.content = note(f'<b style="font-size:1.1em">{html.escape(where)}</b>{saved}', kind="header")
             self._history.visible = session is not None and bool(session.history.past or session.history.future)
-            self._mark_phases()
+            self._show_marks()
+            self._marker.submit(session)
 
     def show_phase(self, phase: str) -> None:
         """Switch to another phase."""
@@ -134,7 +141,6 @@ class Page:
             for name, folder in context.more_folders.items():
                 # those of no phase belong to all
                 folder.visible = name == phase or name not in self._folders
-            self._mark_phases()
             if context.scene_side != scene:
                 context.view.hide_splats(f"/{scene}")
                 self.preview.scene_changed()
@@ -170,16 +176,22 @@ class Page:
             if self.context.phase == "Light":
                 self.phases["Light"].refresh()
 
-    def _mark_phases(self) -> None:
-        """Mark the shown phase, and which of the others are done, out of date, or next."""
-        session, current = self.context.session, self.context.phase
-        states = {name: _STALE for name in PHASES} if session is None else _states(session)
-        following = next((name for name in PHASES if states.get(name) is None and name != "Light"), None)
-        if session is None:
-            states, following = {}, None
+    def _find_marks(self, session: Session | None) -> None:
+        """Find which phases are done, out of date, or next, once nothing has changed for a moment: all photos of a
+        project are looked at."""
+        if not self._marker.wait_idle(_MARK_SECONDS):
+            return
+        marks = {} if session is None else _marks(session)
+        with self.context.lock:
+            if session is self.context.session:
+                self._marks = marks
+                self._show_marks()
+
+    def _show_marks(self) -> None:
+        """Mark the shown phase, and the others as was found last."""
 
         def mark(name: str) -> str:
-            return _CURRENT if name == current else states.get(name) or (_NEXT if name == following else "")
+            return _CURRENT if name == self.context.phase else self._marks.get(name, "")
 
         options = tuple(f"{mark(name)}{name}" for name in PHASES)
         if tuple(self._phase_buttons.options) != options:
@@ -195,18 +207,11 @@ class Page:
 
     def _shown(self, camera: Cameras) -> None:
         """Update what depends on the view, after the preview has put a picture of it on the canvas."""
-        phase = self.phases[self.context.phase]
-        if isinstance(phase, SelectPhase):
-            phase.view_shown()
-        elif isinstance(phase, LightPhase):
-            phase.view_shown(camera)
+        self.phases[self.context.phase].view_shown(camera)
 
     def _job_ended(self, job: JobState) -> None:
-        run, share = self.phases["Run"], self.phases["Share"]
-        if isinstance(run, RunPhase) and job.command[:1] == ("run",) and job.outcome == "done":
-            run.result_made()
-        if isinstance(share, SharePhase):
-            share.job_ended(job)
+        for phase in self.phases.values():
+            phase.job_ended(job)
 
     # undo
 
@@ -233,8 +238,6 @@ class Page:
         editing = self.context.guarded.editing()
         if editing is not None and window.client_id == editing.client_id:
             self.preview.camera_moved()
-            for call in self.context.on_moved:
-                call()
 
     def _windows_changed(self) -> None:
         """Say in each window but the oldest that it is read-only, and show the picture in the one that edits."""
@@ -312,8 +315,8 @@ class Page:
             self._job.refresh()
 
 
-def _states(session: Session) -> dict[str, str | None]:
-    """For each phase whether it is done or out of date; None where neither."""
+def _marks(session: Session) -> dict[str, str]:
+    """The marks of the phases that are done, out of date, or next."""
     files, reasons = session.files, session.project.reasons()
 
     def state(exists: bool, *steps: str) -> str | None:
@@ -322,7 +325,7 @@ def _states(session: Session) -> dict[str, str | None]:
     have_both = files.source_scene.is_file() and files.target_scene.is_file()
     exports = written_exports(files)
     result = max((p.stat().st_mtime_ns for p in (files.result, files.relit) if p.is_file()), default=0)
-    return {
+    states = {
         "Open": state(have_both, "source/reconstruct", "target/reconstruct"),
         "Select": state(files.object.is_file(), "segment"),
         "Place": _DONE if session.objects() else None,
@@ -330,3 +333,6 @@ def _states(session: Session) -> dict[str, str | None]:
         "Run": state(files.result.is_file(), "consolidate"),
         "Share": None if not exports else _DONE if exports[0].stat().st_mtime_ns >= result else _STALE,
     }
+    # a light is found without being set
+    following = next((name for name, mark in states.items() if mark is None and name != "Light"), None)
+    return {name: mark or _NEXT for name, mark in states.items() if mark is not None or name == following}

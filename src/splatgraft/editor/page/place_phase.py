@@ -16,7 +16,7 @@ from splatgraft.editor.page.context import PageContext, Phase, note, parse_path
 from splatgraft.editor.page.handles import SNAP_DEGREES, BoxHandles, ObjectGizmo
 from splatgraft.editor.page.hands import ObjectHands
 from splatgraft.editor.page.preview_panel import PreviewPanel
-from splatgraft.editor.page.scene_view import camera_from_viser
+from splatgraft.editor.page.scene_view import direction_from_viser
 from splatgraft.editor.placement import (
     Gizmo,
     ObjectSize,
@@ -45,8 +45,6 @@ _SNAP_NEAR = 0.5
 """Distance from the surface, over the object's height, within which a drag ends on it."""
 _NUDGE = 0.05
 """Step of an arrow key over the object's height."""
-_NO_PIXELS = 100
-"""Width of a camera of which only the pose counts."""
 _SCALES = ("its photos", "the place")
 _SAME = 0.002
 """Relative difference below which two sizes count as one."""
@@ -108,8 +106,7 @@ class PlacePhase(Phase):
         if window is None or not session.objects():
             return
         item, placed = session.placeable_object(self._chosen), session.objects()[self._chosen].target_from_object
-        camera, up = camera_from_viser(window.camera, width=_NO_PIXELS), session.up()
-        dome = SkyDome.seen_along(camera.world_from_camera[0, :3, 2], up)
+        dome = SkyDome.seen_along(direction_from_viser(window.camera), session.up())
         step = _NUDGE * placed.scale * max(item.base.height, item.base.radius)
         moved = placed.translation + step * (right * dome.right + away * dome.forward)
         self._set_placement(replace(placed, translation=moved))

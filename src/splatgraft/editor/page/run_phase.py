@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import viser
 
+from splatgraft.editor.jobs import JobState
 from splatgraft.editor.page.context import PageContext, Phase, note
 from splatgraft.editor.page.preview_panel import PreviewPanel
 from splatgraft.editor.session import Session
@@ -21,7 +22,7 @@ class RunPhase(Phase):
         """Build the controls."""
         self._context, self._preview, gui = context, preview, context.gui
         self._note = gui.add_html("")
-        self._update = context.on(gui.add_button(_LABEL, icon=viser.Icon.PLAYER_PLAY), self._run)
+        context.on(gui.add_button(_LABEL, icon=viser.Icon.PLAYER_PLAY), self._run)
         with context.more_of("Run"):
             self._method = context.on(
                 gui.add_dropdown("Image model", tuple(HARMONIZERS), initial_value="none"), self._set_method
@@ -46,9 +47,9 @@ class RunPhase(Phase):
         self._note.content = note(self._said(session), kind="result")
         self._command.content = command_line(session.project.run_words(self._last_step()))
 
-    def result_made(self) -> None:
+    def job_ended(self, job: JobState) -> None:
         """Show the result that a job has just made."""
-        if self._context.phase == "Run":
+        if self._context.phase == "Run" and job.command[:1] == ("run",) and job.outcome == "done":
             self.enter()
 
     def _said(self, session: Session) -> str:

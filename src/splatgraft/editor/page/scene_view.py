@@ -242,9 +242,9 @@ class Canvas:
             window._websock_connection.queue_message(_messages.SetSceneNodeVisibilityMessage(name, visible))
 
 
-def camera_from_viser(camera: viser.CameraHandle, *, width: int, min_aspect: float = 0.0) -> Cameras:
-    """The camera of a window, `width` pixels wide; the field of view is widened to at least `min_aspect`."""
-    aspect = max(min_aspect, camera.aspect if camera.aspect > 0 else 1.5)
+def camera_from_viser(camera: viser.CameraHandle, *, width: int) -> Cameras:
+    """The camera of a window, `width` pixels wide."""
+    aspect = camera.aspect if camera.aspect > 0 else 1.5
     height = max(16, round(width / aspect))
     pose = torch.eye(4)
     pose[:3, :3] = rotation_from_quaternion(torch.tensor(np.asarray(camera.wxyz), dtype=torch.float32)[None])[0]
@@ -252,6 +252,12 @@ def camera_from_viser(camera: viser.CameraHandle, *, width: int, min_aspect: flo
     focal = height / (2 * np.tan(camera.fov / 2))
     intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
     return Cameras(pose[None], intrinsics[None], torch.tensor([[width, height]]), ("window",))
+
+
+def direction_from_viser(camera: viser.CameraHandle) -> Float[Tensor, "3"]:
+    """Where a window looks, unit, world frame."""
+    wxyz = torch.tensor(np.asarray(camera.wxyz), dtype=torch.float32)
+    return rotation_from_quaternion(wxyz[None])[0, :, 2]
 
 
 def ray_from_viser(event: viser.SceneClickEvent) -> Ray:

@@ -9,6 +9,7 @@ import torch
 import viser
 from torch import Tensor
 
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.page.context import PageContext, Phase, SceneClicks, note
 from splatgraft.editor.page.handles import BoxHandles
@@ -62,7 +63,7 @@ class SelectPhase(Phase):
         self._mode = gui.add_dropdown("The brush", _STROKES)
         self._isolate = context.on(gui.add_checkbox("Object alone", False), self._set_alone)
         with context.more_of("Select"):
-            self._clear_points = context.on(gui.add_button("Forget all clicks", color="gray"), self._remove_clicks)
+            self._clear_points = gui.add_button("Forget all clicks", color="gray")
             self._size = gui.add_slider("Brush size", 0.01, 0.5, 0.01, 0.1, hint="Over the distance to the surface")
             self._clear = gui.add_button("Forget all strokes", icon=viser.Icon.ERASER, color="gray")
             self._source = gui.add_dropdown("Outlines from", tuple(_SOURCES))
@@ -93,6 +94,7 @@ class SelectPhase(Phase):
         context.on(self._box_group, self._apply_box)
         context.on(gui.add_command("Brush on or off", hotkey="B"), self._toggle_brush)
         context.on(self._clear, lambda: self._set(corrections=None))
+        context.on(self._clear_points, lambda: self._set(prompts=None))
 
     def enter(self) -> None:
         """Take rectangles from the 3D view."""
@@ -142,8 +144,8 @@ class SelectPhase(Phase):
             self._brush.deactivate()
         self._clicks.listen(not self._use_brush.value)
 
-    def view_shown(self) -> None:
-        """Show which photo the view stands at, once it rests."""
+    def view_shown(self, camera: Cameras) -> None:
+        """Show which photo the view stands at."""
         self._show_photo()
 
     def _show_photo(self) -> None:
@@ -186,9 +188,6 @@ class SelectPhase(Phase):
         clicks = "1 click" if count == 1 else f"{count} clicks"
         others = "" if takes else "; outlines are found by clicks now"
         self._context.say(f"{clicks} in {len(prompts or {})} of the photos{others}; cut out again to use them")
-
-    def _remove_clicks(self) -> None:
-        self._set(prompts=None)
 
     def _is_read(self, session: Session) -> bool:
         """Whether the source is at hand; otherwise a sample of it is shown until it is."""
