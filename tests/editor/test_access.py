@@ -76,6 +76,8 @@ def test_the_server_refuses_what_is_foreign_and_serves_only_shared_files(tmp_pat
             found = connection.getresponse()
             found.read()
             connection.close()
+            # behind each answer the server ends the connection, and a client must not send another request into it
+            assert found.headers["Connection"] == "close", path
             return found
 
         page = answer(f"/?token={TOKEN}")

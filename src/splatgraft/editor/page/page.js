@@ -1,6 +1,7 @@
 "use strict";
 // What viser's page has no control for: hands on the object, the divider between two pictures, lights that are dragged on
-// the picture of the sky, and the word that the editor has ended. `page_script.py` says what the server sends and takes.
+// the picture of the sky, and the word that the editor has ended. `preview_panel.py` says what the server tells of the
+// picture, `hands.py` and `light_phase.py` what they answer.
 (() => {
   const CLICK_PX = 4, STALE_MS = 1500, ALIVE_MS = 2000, SWAP_MS = 200, DECODE_MS = 300, HELD_MS = 8000;
   const FLY = new Set(["KeyW", "KeyA", "KeyS", "KeyD", "KeyQ", "KeyE", "ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"]);

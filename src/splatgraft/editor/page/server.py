@@ -154,6 +154,15 @@ class GuardedServer:
     async def _answer(
         self, inner: Callable[..., Response | None], connection: Any, request: Request
     ) -> Response | None:
+        response = await self._checked(inner, connection, request)
+        if response is not None:
+            # websockets closes it behind each answer; a client that is not told sends its next request into it
+            response.headers["Connection"] = "close"
+        return response
+
+    async def _checked(
+        self, inner: Callable[..., Response | None], connection: Any, request: Request
+    ) -> Response | None:
         # a repeated header is joined, so that it matches no accepted value
         found = {name: request.headers.get_all(name) for name in ("Host", "Origin", "Upgrade", "Cookie")}
         headers = {name: ("; " if name == "Cookie" else ", ").join(values) for name, values in found.items() if values}
