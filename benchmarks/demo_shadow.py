@@ -21,10 +21,10 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
-from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.images import LUMINANCE
 from splatgraft.folders.composite_folder import read_composite
 from splatgraft.formats import read_cameras, read_gaussians
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.sun import SurfacePicture, draw_surface, find_surface, standing_on
 from splatgraft.relighting.shadows.shadow_maps import occluders_of
 
@@ -65,18 +65,20 @@ def shadows_of(demo: Path, folders: tuple[str, ...]) -> Iterator[tuple[str, floa
     scene, placed = composite.target, composite.objects[0].in_target()
     place = bounding_sphere(placed)
     region = BoundingSphere(place.center, _RADII * place.radius)
-    surface = find_surface(scene, cameras, region, estimate_up(cameras))
+    captured = CapturedScene(scene, cameras)
+    surface = find_surface(captured, region)
     assert surface is not None
     cup = surface.shadows(standing_on(surface, scene, region), SUN[None])[0]
     bananas = surface.shadows(occluders_of(placed), SUN[None])[0]
-    table = luminance(draw_surface(scene, cameras, surface))
+    table = luminance(draw_surface(captured, surface))
     lit = float(table[(cup > 0.99) & ~table.isnan()].median())
-    under = (surface.texels - place.center).norm(dim=-1) < place.radius
+    under = (surface.texels() - place.center).norm(dim=-1) < place.radius
     texel = 2000 * surface.half / len(cup)
     rows = [("cup", table / lit, cup, bananas < 0.99)]
     for folder in folders:
-        after = luminance(draw_surface(read_gaussians(demo / folder / "scene.ply"), cameras, surface))
-        rows.append((f"bananas, {folder}", after / table, bananas, (cup < 0.99) | under))
+        after = CapturedScene(read_gaussians(demo / folder / "scene.ply"), cameras)
+        shown = luminance(draw_surface(after, surface))
+        rows.append((f"bananas, {folder}", shown / table, bananas, (cup < 0.99) | under))
     for name, ratio, visible, apart in rows:
         dark, width = measured(ratio, visible, apart)
         yield name, dark, width * texel

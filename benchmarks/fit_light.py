@@ -26,6 +26,7 @@ from torch import Tensor
 
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.directions import even_directions
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama import NoLight
@@ -76,8 +77,8 @@ def places_of(scene: ExamScene) -> Pair:
     """The new and the old place, estimated by nothing but the reconstructions."""
     placed, source = scene.composite.objects[0], scene.source
     there, thing = bounding_sphere(placed.gaussians), placed.gaussians
-    new = estimate_light(scene.composite.target, bounding_sphere(placed.in_target()), scene.cameras)
-    old = estimate_light(source.gaussians, there, source.cameras, object_gaussians=thing)
+    new = estimate_light(CapturedScene(scene.composite.target, scene.cameras), bounding_sphere(placed.in_target()))
+    old = estimate_light(CapturedScene(source.gaussians, source.cameras), there, object_gaussians=thing)
     return _place(new, scene.new_light), _place(old, scene.old_light)
 
 

@@ -15,9 +15,9 @@ from exam_scenes import scene_arguments, scenes_in
 
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import LUMINANCE
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.estimate import region_around
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.sun import Sun, find_sun
@@ -79,7 +79,7 @@ def main() -> None:
     for name, read in scenes_in(scene_arguments(__doc__).parse_args()):
         for suffix, whole, cameras, place, truth in places_of(read()):
             places += 1
-            sun = find_sun(whole, cameras, region_around(place, cameras), estimate_up(cameras), decisive=min(_BARS))
+            sun = find_sun(CapturedScene(whole, cameras), region_around(place, cameras), decisive=min(_BARS))
             if sun is None:
                 continue
             one = judge(sun, truth)

@@ -22,6 +22,7 @@ from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.relighting import Light, LightSource, RelightOptions, SourceScene, relight
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.cast_shadows import cast_shadows
 from splatgraft.relighting.layers import assemble_layers
 from splatgraft.relighting.light.light import fit_ambient
@@ -84,7 +85,7 @@ def measure(count: int, *, repeats: int, clock: Callable[[], float] = time.perf_
 
     composite, options = placed_at(0.0), RelightOptions()
     spheres = [bounding_sphere(composite.objects[0].in_target())]
-    there = find_scene_light(scene, cameras, spheres, light=light, reach=options.reach)
+    there = find_scene_light(CapturedScene(scene, cameras), spheres, light=light, reach=options.reach)
     assert isinstance(there, SceneLight)
     old = find_source_light(ball, origin)
     prepared = prepare_object(composite.objects[0], origin, cameras, source_light=old, light=there.light, number=1)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
-LONG = ("04_project", "05_several_objects")
+LONG = ("02_segment", "04_project", "05_several_objects")
 
 
 @pytest.mark.parametrize(

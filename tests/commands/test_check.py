@@ -115,7 +115,7 @@ def test_photos_in_no_order_hang_together_by_whatever_shows_the_same_place(
     wall = np.hstack([texture(seed) for seed in range(5)])
     width, height = SIZE
     # each shows what two or three others show
-    photos = [wall[:height, 150 * i : 150 * i + width] for i in np.random.default_rng(1).permutation(46)]
+    photos = [wall[:height, 150 * i : 150 * i + width] for i in np.random.default_rng(1).permutation(COUNT)]
     photos[3] = np.rot90(photos[3])  # held on its side, which is no other camera
     _, findings, verdict = check(save(tmp_path / "photos", photos), capsys)
     assert (verdict, findings["overlap"]["level"], findings["sizes"]["level"]) == ("good", "good", "good")

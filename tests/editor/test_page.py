@@ -374,6 +374,9 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
         assert "out of date: you moved the object" in share._stale.content
         phase_of(page, "Run")
         assert "out of date: you moved the object" in run._note.content
+        # back at the edits, the picture is theirs
+        page.show_phase("Place")
+        assert page.preview._right.value == "Light transfer"
 
 
 def test_a_picture_that_was_begun_before_select_is_not_shown_there(page: Page) -> None:

@@ -20,6 +20,7 @@ from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.formats import read_cameras, read_gaussians
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
 from splatgraft.relighting.light.light import Light, fit_ambient
@@ -33,7 +34,6 @@ from splatgraft.relighting.light.panorama import (
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.sun import SET_BY_HAND, find_sun, set_sun, with_sun
-from splatgraft.relighting.normals import estimate_normals
 
 
 def shell(colors, directions, *, radius=2.0, spread=0.12):
@@ -162,7 +162,7 @@ def towards(height_deg, azimuth):
 
 
 def evidence_of(scene):
-    evidence = find_highlights(scene, estimate_normals(scene, high_views()), high_views(), region=REGION)
+    evidence = find_highlights(CapturedScene(scene, high_views()), region=REGION)
     assert evidence is not None
     return evidence
 
@@ -211,11 +211,10 @@ def test_each_material_has_its_own_gloss():
 
 def test_matt_tables_and_flat_colours_have_no_highlights():
     scene = table(UP, gloss=0.0)
-    normals = estimate_normals(scene, high_views())
-    evidence = find_highlights(scene, normals, high_views(), region=REGION)
+    evidence = find_highlights(CapturedScene(scene, high_views()), region=REGION)
     # what is left is the rounding of float32, 1e-5
     assert evidence is None or evidence.variance < 1e-10
-    assert find_highlights(scene.with_sh_degree(0), normals, high_views(), region=REGION) is None
+    assert find_highlights(CapturedScene(scene.with_sh_degree(0), high_views()), region=REGION) is None
 
 
 COUNT = len(DIRECTIONS)
@@ -291,7 +290,7 @@ def views(levels=(0.0,)):
 
 def estimated(scene, cameras=None) -> Light:
     place = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3)
-    found = estimate_light(scene, place, views() if cameras is None else cameras)
+    found = estimate_light(CapturedScene(scene, views() if cameras is None else cameras), place)
     assert isinstance(found, EstimatedLight)
     return found.light
 
@@ -326,7 +325,7 @@ def painted(scene, gray):
 
 
 def sun_of(scene):
-    return find_sun(scene, views(), BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 2.4), UP)
+    return find_sun(CapturedScene(scene, views()), BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 2.4))
 
 
 def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s_edge_shows():
@@ -335,7 +334,7 @@ def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s
     # named a little beside where they are
     off = torch.tensor([0.02, -0.01, 0.0])
     points = [tuple(at.tolist()) for top in tops for at in (top + off, top - sun * top[2] / sun[2])]
-    found = set_sun(points, scene, views(), UP)
+    found = set_sun(points, CapturedScene(scene, views()))
     assert degrees_apart(found.direction, sun) < 3
     assert found.name == SET_BY_HAND
     assert found.ratio is not None
@@ -345,12 +344,12 @@ def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s
     assert light.irradiance(UP[None])[0].tolist() == pytest.approx([math.pi] * 3, rel=0.02)
     assert light.sources[0].direction == pytest.approx(tuple(found.direction.tolist()))
     with pytest.raises(ValueError, match="then its shadow below it"):
-        set_sun(points[::-1], scene, views(), UP)
+        set_sun(points[::-1], CapturedScene(scene, views()))
     with pytest.raises(ValueError, match="expected pairs"):
-        set_sun(points[:3], scene, views(), UP)
+        set_sun(points[:3], CapturedScene(scene, views()))
     # far from all surfaces there is no edge: only the direction is taken from the points
     away = [(20.0 + x, y, z) for x, y, z in points]
-    assert set_sun(away, scene, views(), UP).ratio is None
+    assert set_sun(away, CapturedScene(scene, views())).ratio is None
 
 
 def test_shadows_show_the_sun_on_a_floor_of_two_materials():
@@ -422,7 +421,8 @@ def test_what_shadows_alone_show_is_named_by_where_it_may_be(height, name):
 @pytest.mark.parametrize("strength", [0.0, 1.0])
 def test_a_white_floor_is_no_source(strength):
     bright = painted(sunlit_scene(UP, strength), lambda at: torch.where(at[:, 0] > 1, 8.0, 0.3))
-    found = estimate_light(bright, BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.1), views((0.0, 1.5)))
+    place = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.1)
+    found = estimate_light(CapturedScene(bright, views((0.0, 1.5))), place)
     assert isinstance(found, EstimatedLight)
     assert all(source.direction[2] > 0 for source in found.mean.sources)
     # its light still arrives: more on what faces it than on what faces away
@@ -448,7 +448,7 @@ def test_the_estimate_does_not_depend_on_the_world_axes():
     poses = cameras.world_from_camera.clone()
     poses[:, :3] = turn @ poses[:, :3]
     place = BoundingSphere(turn @ torch.tensor([0.0, 0.0, 0.3]), 0.3)
-    found = estimate_light(turned_scene, place, replace(cameras, world_from_camera=poses))
+    found = estimate_light(CapturedScene(turned_scene, replace(cameras, world_from_camera=poses)), place)
     assert isinstance(found, EstimatedLight)
     assert math.degrees(math.acos(min(1.0, float(torch.tensor(found.light.sources[0].direction) @ (turn @ sun))))) < 11
 
@@ -477,7 +477,7 @@ def room() -> Gaussians:
 
 @pytest.mark.parametrize(("count", "degree"), [(1, 0), (12, 3)])
 def test_few_views_and_no_bands_give_a_finite_light(count, degree):
-    light = estimate_light(room().with_sh_degree(degree), PLACE, ring(count))
+    light = estimate_light(CapturedScene(room().with_sh_degree(degree), ring(count)), PLACE)
     assert isinstance(light, EstimatedLight)
     found = light.light.irradiance(even_directions(50))
     assert bool(torch.isfinite(found).all())
@@ -490,7 +490,7 @@ def test_values_that_are_not_finite_or_huge_leave_the_light_finite(field, value)
     scene = room()
     changed = getattr(scene, field).clone()
     changed[::97] = value
-    light = estimate_light(replace(scene, **{field: changed}), PLACE, ring())
+    light = estimate_light(CapturedScene(replace(scene, **{field: changed}), ring()), PLACE)
     assert isinstance(light, EstimatedLight)
     found = light.light.irradiance(even_directions(50))
     assert bool(torch.isfinite(found).all())
@@ -513,7 +513,7 @@ def test_the_light_of_a_room_is_the_same_from_two_runs_of_poses(tmp_path):
         focus = focus_point(cameras)
         away = float((cameras.centers - focus).norm(dim=1).median())
         place = BoundingSphere(focus + 0.2 * away * estimate_up(cameras), 0.1 * away)
-        light = estimate_light(read_gaussians(scene / "scene.ply"), place, cameras)
+        light = estimate_light(CapturedScene(read_gaussians(scene / "scene.ply"), cameras), place)
         assert isinstance(light, EstimatedLight)
         found.append((cameras, light.mean))
     # the worlds of the two runs differ: the rotation between them, from the cameras that both have

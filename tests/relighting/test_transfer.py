@@ -27,6 +27,7 @@ from splatgraft.relighting import (
     light_to_json,
     relight,
 )
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.cast_shadows import SHADOW_POWER, cast_shadows
 from splatgraft.relighting.layers import assemble_layers
 from splatgraft.relighting.light.light import fit_ambient
@@ -235,7 +236,7 @@ def test_values_that_moved_with_the_object_give_what_new_ones_do():
     def spheres(x):
         return [bounding_sphere(at(x, 0.0, 0.35).gaussians(body))]
 
-    first = find_scene_light(scene, cameras(), spheres(0.0), light=light, reach=WHOLE.reach)
+    first = find_scene_light(CapturedScene(scene, cameras()), spheres(0.0), light=light, reach=WHOLE.reach)
     assert isinstance(first, SceneLight)
     there = first.moved(spheres(0.2))
     assert isinstance(there, SceneLight)

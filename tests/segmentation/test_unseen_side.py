@@ -60,7 +60,7 @@ def greenest(scene: Gaussians, cameras: Cameras) -> float:
     return float((color[..., 1] - color[..., [0, 2]].amax(-1)).max())
 
 
-@pytest.mark.parametrize("turn", [0.0, 180.0])
+@pytest.mark.parametrize("turn", [0.0, pytest.param(180.0, marks=pytest.mark.long)])
 def test_the_back_of_what_was_photographed_from_one_side_is_opaque_and_has_its_colours(turn: float) -> None:
     whole, cameras, behind = egg(turn + 90), ring(turn, turn + 180), ring(turn + 220, turn + 320)
     seen = photographed(whole, cameras)

@@ -19,6 +19,7 @@ from splatgraft.folders.composite_folder import read_composite
 from splatgraft.formats import is_scene, read_cameras, read_gaussians
 from splatgraft.project.layout import CAMERAS_FILE, PROJECT_FILE, SCENE_FILE
 from splatgraft.project.step import Positional
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.environment import environment_radiance, equirectangular_directions
 from splatgraft.relighting.light.estimate import estimate_light
 from splatgraft.relighting.light.light import Light, light_to_json
@@ -146,10 +147,11 @@ def _light_at(
     given = step.given()
     if given is not None:
         return given, given.ambient_radiance(directions.reshape(-1, 3)).reshape(directions.shape)
-    found = estimate_light(scene, place, cameras, sun_through=step.options.sun_through)
+    captured = CapturedScene(scene, cameras)
+    found = estimate_light(captured, place, sun_through=step.options.sun_through)
     if isinstance(found, NoLight):
         raise ValueError(f"--at: expected a place with light around it, found none. {found.reason}")
-    return found.light, environment_radiance(found, scene, place, directions)
+    return found.light, environment_radiance(found, captured, place, directions)
 
 
 COMMAND = LightAt

@@ -196,6 +196,7 @@ _EDITS = {
     "corrections.npy": "you changed the selection",
     "prompts.json": "you clicked in the photos",
     "light.json": "you changed the light",
+    "scene.ply": "the scene that it is made from is a new one",
 }
 
 

@@ -22,6 +22,7 @@ from splatgraft.editor.memo import Memo
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState
 from splatgraft.relighting import Light, RelightOptions, Relit, SourceScene
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.cast_shadows import cast_shadows
 from splatgraft.relighting.gain import relight_by_gain
 from splatgraft.relighting.layers import assemble_layers, pasted
@@ -140,10 +141,12 @@ class _TransferValues:
                 self._memo.put(f"{kind}, moved", (kept[1],), moved)
             if moved is not None:
                 return moved
-        target = composite.target.select(~composite.erased)
-        found = find_scene_light(
-            target, cameras, spheres, light=light, reach=options.reach, sun_through=options.sun_through
+        captured = self._memo.get(
+            "captured",
+            (composite.target, composite.erased, cameras),
+            lambda: CapturedScene(composite.target.select(~composite.erased), cameras),
         )
+        found = find_scene_light(captured, spheres, light=light, reach=options.reach, sun_through=options.sun_through)
         if isinstance(found, SceneLight):
             self._memo.put(kind, inputs, (poses, found))
         return found
@@ -151,7 +154,7 @@ class _TransferValues:
     def _object(
         self, number: int, placed: PlacedObject, source: SourceScene | None, scene: SceneLight, *, exact: bool
     ) -> PreparedObject:
-        name, inputs = f"object {number}", (placed.gaussians, source, scene.cameras)
+        name, inputs = f"object {number}", (placed.gaussians, source, scene.captured.cameras)
         kept: PreparedObject | None = self._memo.peek(name, inputs)
         place = placed.target_from_object.translation
         if kept is not None and not (exact and not torch.equal(kept.target_from_object.translation, place)):
@@ -164,7 +167,7 @@ class _TransferValues:
             pair = (placed.gaussians, source)
             source_light = self._memo.get("source light", pair, lambda: find_source_light(*pair))
         prepared = prepare_object(
-            placed, source, scene.cameras, source_light=source_light, light=scene.light, number=number
+            placed, source, scene.captured.cameras, source_light=source_light, light=scene.light, number=number
         )
         self._memo.put(name, inputs, prepared)
         return prepared

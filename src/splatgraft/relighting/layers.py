@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
-from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
@@ -204,10 +203,10 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
     """
     shadings = [_shading(one, scene, shares) for one, shares in zip(objects, shadows.scene_visibility, strict=True)]
     receivers, on_scene, catchers = shadows.receivers, shadows.on_scene, shadows.catchers
-    rest = torch.ones(scene.scene.count, dtype=torch.bool)
+    rest = torch.ones(scene.captured.gaussians.count, dtype=torch.bool)
     rest[receivers.origin] = False
     rest_index = rest.nonzero()[:, 0]
-    object_rows = torch.arange(scene.scene.count, merged.count)
+    object_rows = torch.arange(scene.captured.gaussians.count, merged.count)
     black = catchers.clear
     gaussians = concatenate([black, merged.select(rest_index), receivers.gaussians, merged.select(object_rows)])
     count = gaussians.count - len(object_rows)
@@ -239,7 +238,7 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
 def _light_note(scene: SceneLight) -> Note:
     """What the light at the new place is, and whether most of it is a guess."""
     end = "." if scene.estimate is not None else ", as given."
-    text = f"At the new place: {scene.light.describe(estimate_up(scene.cameras))}{end}"
+    text = f"At the new place: {scene.light.describe(scene.captured.up)}{end}"
     certain = light_confidence(scene.light)
     if certain >= _MIN_CERTAIN:
         return Note(text)

@@ -5,26 +5,27 @@ normal. The covariance joins the Gaussian's own shape, its neighbours' shapes an
 defined for round Gaussians too. Which camera sees a Gaussian follows from a small depth image.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numba import prange
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.nearest_neighbours import nearest_neighbours
-from splatgraft.rendering import render
+from splatgraft.rendering import Render, render
 from splatgraft.runtime.kernels import kernel, serialized
 
 # set by hand
 _NEIGHBOURS = 16
 """Gaussians per mixture."""
-_CAMERAS = 8
-"""Cameras whose view is tested."""
+_CAMERAS, _CAMERA_PX = 8, 128
+"""Cameras whose view is tested where none is given, and the longest side of their depth images, pixels."""
 _UNSEEN_CONFIDENCE = 0.5
 """Factor on the confidence of normals that no tested camera sees."""
 _RAISED = 1.5
@@ -46,21 +47,27 @@ class Normals:
     seen: Bool[Tensor, "n"]
     """Whether some camera sees it unoccluded; the colour of others was never observed."""
 
+    def select(self, rows: Int[Tensor, "m"]) -> "Normals":
+        """Those of some of the Gaussians."""
+        return Normals(self.vectors[rows], self.confidence[rows], self.seen[rows])
 
-def estimate_normals(gaussians: Gaussians, cameras: Cameras, *, among: Gaussians | None = None) -> Normals:
+
+def estimate_normals(
+    gaussians: Gaussians, cameras: Cameras, *, views: Sequence[tuple[Cameras, Render]] | None = None
+) -> Normals:
     """Normals of `gaussians`, towards the cameras that see each one; with less confidence where none does.
 
     Args:
         gaussians: n Gaussians.
-        cameras: Of their capture; some of them, spread over the list, are tested.
-        among: All Gaussians that may occlude them; `gaussians` themselves by default.
+        cameras: Of their capture.
+        views: The depth of `gaussians` in single cameras, which are tested; by default in a few, spread over the list.
     """
     n = gaussians.count
     if n == 0:
         return Normals(vectors=torch.zeros(0, 3), confidence=torch.zeros(0), seen=torch.zeros(0, dtype=torch.bool))
     neighbours = nearest_neighbours(gaussians.means, count=_NEIGHBOURS).numpy()
     cloud = (gaussians.means.numpy(), gaussians.covariances.numpy(), gaussians.opacities.numpy())
-    towards, seen = _towards_cameras(gaussians, cameras, gaussians if among is None else among)
+    towards, seen = _towards_cameras(gaussians, _depth_views(gaussians, cameras) if views is None else views)
     out = np.zeros((n, 4), np.float32)
     _estimate(cloud, neighbours, towards.numpy(), out)
     result = torch.from_numpy(_smoothed(out, neighbours))
@@ -74,18 +81,19 @@ def raised(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor,
     return gaussians.means + _RAISED * half.norm(dim=1, keepdim=True) * normals
 
 
+def _depth_views(gaussians: Gaussians, cameras: Cameras) -> list[tuple[Cameras, Render]]:
+    small = cameras.spread(_CAMERAS).limited(_CAMERA_PX)
+    return [(camera, render(gaussians, camera, outputs=frozenset({"depth"}))) for camera in small]
+
+
 def _towards_cameras(
-    gaussians: Gaussians, cameras: Cameras, among: Gaussians
+    gaussians: Gaussians, views: Sequence[tuple[Cameras, Render]]
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
     """Sum of unit vectors to the cameras that see each Gaussian (to all where none does), and whether any does."""
     total = np.zeros((2, gaussians.count, 3), np.float32)
-    for i in spread_over(cameras, count=_CAMERAS):
-        _add_directions(
-            gaussians.means.numpy(),
-            cameras[i].centers[0].numpy(),
-            seen_from(gaussians, cameras[i], among=among).numpy(),
-            total,
-        )
+    for camera, drawn in views:
+        seen = is_seen(gaussians, camera, drawn).numpy()
+        _add_directions(gaussians.means.numpy(), camera.centers[0].numpy(), seen, total)
     to_seeing, to_all = torch.from_numpy(total)
     seen_at_all = to_seeing.norm(dim=1) > 0
     return torch.where(seen_at_all[:, None], to_seeing, to_all), seen_at_all
@@ -199,8 +207,6 @@ def _smoothed(normals, neighbours):
 
 
 # set by hand
-_WIDTH = 128
-"""Pixels; width of the depth image."""
 _SURFACE_ALPHA = 0.5
 """A pixel of at least this alpha shows a surface."""
 _DEPTH_TOLERANCE = np.float32(0.005)
@@ -209,24 +215,16 @@ _BEHIND = 2
 """Standard deviations by which it may lie behind, besides."""
 
 
-def spread_over(cameras: Cameras, *, count: int) -> list[int]:
-    """At most `count` cameras, evenly over the list."""
-    last = len(cameras) - 1
-    return sorted({round(j * last / max(count - 1, 1)) for j in range(min(count, len(cameras)))})
-
-
-def seen_from(gaussians: Gaussians, camera: Cameras, *, among: Gaussians) -> Bool[Tensor, "n"]:
+def is_seen(gaussians: Gaussians, camera: Cameras, drawn: Render) -> Bool[Tensor, "n"]:
     """Whether one camera sees each Gaussian's centre.
 
     Args:
         gaussians: The n Gaussians that are tested.
         camera: A single camera.
-        among: All Gaussians that may occlude them.
+        drawn: The depth that it sees of all Gaussians that may occlude them.
     """
-    small = camera.resized(_WIDTH / int(camera.sizes[0, 0]))
-    rendered = render(among, small, outputs=frozenset({"depth"}))
-    surface = torch.where(rendered.alpha[0] > _SURFACE_ALPHA, rendered.depth[0], torch.inf).numpy()
-    pose, intrinsics = small.camera_from_world[0].numpy(), small.intrinsics[0].numpy()
+    surface = torch.where(drawn.alpha[0] > _SURFACE_ALPHA, drawn.depth[0], torch.inf).numpy()
+    pose, intrinsics = camera.camera_from_world[0].numpy(), camera.intrinsics[0].numpy()
     out = np.zeros(gaussians.count, np.bool_)
     _compare_depths(gaussians.means.numpy(), gaussians.scales.mean(1).numpy(), (pose, intrinsics), surface, out)
     return torch.from_numpy(out)

@@ -16,6 +16,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.light import Light, LightSource
 from splatgraft.relighting.light.panorama import NoLight
@@ -122,8 +123,8 @@ def find_source_light(object_gaussians: Gaussians, source: SourceScene | None) -
         return None
     if source.light is not None:
         return source.light
-    place = bounding_sphere(object_gaussians)
-    return estimate_light(source.gaussians, place, source.cameras, object_gaussians=object_gaussians)
+    place, captured = bounding_sphere(object_gaussians), CapturedScene(source.gaussians, source.cameras)
+    return estimate_light(captured, place, object_gaussians=object_gaussians)
 
 
 def prepare_object(

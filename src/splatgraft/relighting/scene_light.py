@@ -15,10 +15,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
-from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.spherical_harmonics import rgb_from_dc
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light, with_source_distances
 from splatgraft.relighting.light.evidence import group_materials
 from splatgraft.relighting.light.light import Light
@@ -26,17 +26,10 @@ from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.light.samples import LightSamples, main_source_samples, sample_light
 from splatgraft.relighting.light.sun import Point
 from splatgraft.relighting.nearest_neighbours import nearest_neighbours
-from splatgraft.relighting.normals import Normals, estimate_normals
+from splatgraft.relighting.normals import Normals
 from splatgraft.relighting.shading import irradiance
 from splatgraft.relighting.shadows.receivers import RIM, Receivers, above_layer, layer_middle
-from splatgraft.relighting.shadows.scene_ratio import (
-    AMBIENT_SIZE,
-    SceneShadowMaps,
-    reachable,
-    scene_shadow_maps,
-    scene_visibility,
-)
-from splatgraft.relighting.shadows.shadow_maps import thinned
+from splatgraft.relighting.shadows.scene_ratio import SceneShadowMaps, reachable, scene_shadow_maps, scene_visibility
 
 # the region of the shadow maps; set by hand
 _MARGIN = 1.2
@@ -67,10 +60,8 @@ _RAMP_START, _RAMP_WIDTH = 0.2, 0.4
 class SceneLight:
     """The light of a scene at the place of objects, and the m receivers of their shadows."""
 
-    scene: Gaussians
+    captured: CapturedScene
     """All Gaussians that are not erased."""
-    cameras: Cameras
-    """Cameras of the scene's capture."""
     light: Light
     """At the objects' place."""
     estimate: EstimatedLight | None
@@ -102,7 +93,7 @@ class SceneLight:
             return None
         estimate, light = None, self.light
         if self.estimate is not None:
-            estimate = self.estimate.at(self.scene, self.cameras, place)
+            estimate = self.estimate.at(self.captured, place)
             if isinstance(estimate, NoLight):
                 return estimate
             light = estimate.light
@@ -112,13 +103,12 @@ class SceneLight:
             for new, old in zip(spheres, self.receivers_of, strict=True)
         ):
             return there
-        receivers = _receivers(self.scene, self.cameras, spheres, light, self.maps)
+        receivers = _receivers(self.captured, spheres, light, self.maps)
         return replace(there, receivers=receivers, receivers_of=tuple(spheres))
 
 
 def find_scene_light(
-    scene: Gaussians,
-    cameras: Cameras,
+    captured: CapturedScene,
     spheres: Sequence[BoundingSphere],
     *,
     light: Light | None,
@@ -128,17 +118,16 @@ def find_scene_light(
     """Find the light of a scene at the place of objects.
 
     Args:
-        scene: All Gaussians that are not erased.
-        cameras: Of its capture.
+        captured: All Gaussians that are not erased.
         spheres: Of the objects, at least one.
         light: At the objects' place, its sources seen from there; None to estimate it.
         reach: Object radii to which shadows are computed.
         sun_through: Points and their shadows, as for `light.sun.set_sun`: an estimate has this sun.
     """
-    place = place_of(spheres)
+    place, scene = place_of(spheres), captured.gaussians
     estimate = None
     if light is None:
-        found = estimate_light(scene, place, cameras, sun_through=sun_through)
+        found = estimate_light(captured, place, sun_through=sun_through)
         if isinstance(found, NoLight):
             return found
         estimate, light = found, found.light
@@ -146,8 +135,8 @@ def find_scene_light(
         light = with_source_distances(light, scene, place)
     samples = sample_light(light)
     maps = scene_shadow_maps(scene, BoundingSphere(place.center, _MARGIN * (place.radius * reach)), samples)
-    receivers = _receivers(scene, cameras, spheres, light, maps)
-    return SceneLight(scene, cameras, light, estimate, samples, maps, receivers, tuple(spheres), reach)
+    receivers = _receivers(captured, spheres, light, maps)
+    return SceneLight(captured, light, estimate, samples, maps, receivers, tuple(spheres), reach)
 
 
 def place_of(spheres: Sequence[BoundingSphere]) -> BoundingSphere:
@@ -157,19 +146,17 @@ def place_of(spheres: Sequence[BoundingSphere]) -> BoundingSphere:
 
 
 def _receivers(
-    scene: Gaussians, cameras: Cameras, spheres: Sequence[BoundingSphere], light: Light, maps: SceneShadowMaps
+    captured: CapturedScene, spheres: Sequence[BoundingSphere], light: Light, maps: SceneShadowMaps
 ) -> Receivers:
     """Gaussians that the objects may reach from where they are, and after a move by up to their radius."""
-    region, samples = maps.region, sample_light(light)
+    scene, region, samples = captured.gaussians, maps.region, sample_light(light)
     reached = torch.zeros(scene.count, dtype=torch.bool)
     rims = RIM * scene.scales.max(1).values
     for sphere in spheres:
         reached |= reachable(scene.means, sphere, samples, farthest=region.radius, rims=rims + sphere.radius)
     indices = (reached & ((scene.means - region.center).norm(dim=1) < region.radius)).nonzero()[:, 0]
     gaussians = scene.select(indices)
-    # for the test of what cameras see, occluders need not be finer than a shadow map's pixel
-    occluders = thinned(scene, width=2 * region.radius / AMBIENT_SIZE)
-    normals = estimate_normals(gaussians, cameras, among=occluders)
+    normals = captured.normals.select(indices)
     shares = scene_visibility(maps, above_layer(gaussians, normals.vectors), normals.vectors)
     return Receivers(
         gaussians=gaussians,

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.composite import Composite
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.cast_shadows import cast_shadows
 from splatgraft.relighting.layers import Relit, assemble_layers, pasted
 from splatgraft.relighting.light.light import Light
@@ -77,11 +78,9 @@ def relight(
     placed = [(i, p, s) for i, (p, s) in enumerate(zip(composite.objects, given, strict=True), 1) if p.gaussians.count]
     if not placed:
         return pasted(composite, "No object is placed: nothing to light.")
-    target = composite.target.select(~composite.erased)
+    captured = CapturedScene(composite.target.select(~composite.erased), cameras)
     spheres = [bounding_sphere(one.in_target()) for _, one, _ in placed]
-    scene = find_scene_light(
-        target, cameras, spheres, light=light, reach=options.reach, sun_through=options.sun_through
-    )
+    scene = find_scene_light(captured, spheres, light=light, reach=options.reach, sun_through=options.sun_through)
     if isinstance(scene, NoLight):
         return pasted(composite, f"{scene.reason} The object is pasted as it is.")
     objects, old_lights = [], dict[tuple[int, int], SourceLight]()

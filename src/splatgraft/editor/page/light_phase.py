@@ -24,6 +24,7 @@ from splatgraft.editor.picking import first_surface_hit
 from splatgraft.editor.session import Session
 from splatgraft.editor.sky_dome import SkyDome
 from splatgraft.relighting import LayerWeights, Light, LightSource
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.sun import Point, set_sun, with_sun
 
 _FIRST = (
@@ -100,6 +101,10 @@ class LightPhase(Phase):
         self._remove_handle()
         self._hide_arrows()
         self._sun_clicks.leave()
+
+    def enter(self) -> None:
+        """Show the light transfer, which follows the edits."""
+        self._preview.show_edits()
 
     def refresh(self) -> None:
         """Update the target, the arrows, description and strengths."""
@@ -344,7 +349,7 @@ class SunClicks:
             return
         self._points, light = points[:-2], self._light_of(session)
         assert light is not None
-        sun = set_sun(points, scene, session.scenes.cameras(files.target_cameras), session.up())
+        sun = set_sun(points, CapturedScene(scene, session.scenes.cameras(files.target_cameras)))
         session.change(replace(state, light=with_sun(light, sun)))
         self._points, self._set_light = points, session.state.light
         pairs = len(points) // 2

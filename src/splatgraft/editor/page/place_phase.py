@@ -117,6 +117,10 @@ class PlacePhase(Phase):
         self._gizmo.remove()
         self._hands.release()
 
+    def enter(self) -> None:
+        """Show the light transfer, which follows the edits."""
+        self._preview.show_edits()
+
     def refresh(self) -> None:
         """Update the 3D view, the list of objects, the numbers and the gizmo."""
         session = self._context.session

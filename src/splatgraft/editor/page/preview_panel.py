@@ -193,6 +193,11 @@ class PreviewPanel:
         self._left.value, self._right.value = left, right
         self.update()
 
+    def show_edits(self) -> None:
+        """Select the pictures that follow the edits, where those of the result were selected, which do not."""
+        if self._right.value == "Result":
+            self.show("Copy-paste", "Light transfer")
+
     def update(self) -> None:
         """Request a picture of the current state."""
         self._submit(is_moved=False)

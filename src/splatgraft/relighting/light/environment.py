@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
-from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import LUMINANCE
-from splatgraft.relighting.light.estimate import EstimatedLight, usable_gaussians
+from splatgraft.relighting.captured_scene import CapturedScene
+from splatgraft.relighting.light.estimate import EstimatedLight
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
     NEAREST,
@@ -40,19 +40,19 @@ def equirectangular_directions(height: int) -> Float[Tensor, "h w 3"]:
 
 
 def environment_radiance(
-    found: EstimatedLight, scene: Gaussians, place: BoundingSphere, directions: Float[Tensor, "h w 3"]
+    found: EstimatedLight, captured: CapturedScene, place: BoundingSphere, directions: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "h w 3"]:
     """Linear rgb radiance at a place without the sources of the estimate's light, at least 0.
 
     Args:
         found: The estimate at `place`.
-        scene: All Gaussians, without the object.
+        captured: The scene without the object.
         place: What is nearer than half of its radius is left out.
         directions: Unit, world frame.
     """
     height, width, _ = directions.shape
     flat, face = directions.reshape(-1, 3), max(height, 1)
-    cube = render_panorama(usable_gaussians(scene), place.center, size=face, nearest=NEAREST * place.radius)
+    cube = render_panorama(captured.usable.gaussians, place.center, size=face, nearest=NEAREST * place.radius)
     shown = cube.radiance.reshape(-1, 3)[cube_pixels(flat, face)]
     around, rest = found.evidence.around, found.rest()
     # a source that was photographed is cut down to what is around it

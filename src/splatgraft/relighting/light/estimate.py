@@ -15,10 +15,10 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras, look_at, pinhole
-from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.directions import fit_sh
-from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import LUMINANCE
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.evidence import find_highlights, find_shading_evidence
 from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg
 from splatgraft.relighting.light.panorama import (
@@ -33,18 +33,13 @@ from splatgraft.relighting.light.panorama import (
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
 from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, with_sun
-from splatgraft.relighting.normals import estimate_normals
 from splatgraft.rendering import render
 
 # the evidence; set by hand
-_HUGE = 1e6
-"""World units, and units of colour; larger Gaussians are a format's or an optimiser's fault."""
 _OVERHEAD = 0.5
 """Cosine to the up direction of what counts as ceiling, 60 degrees."""
 _MIN_RADII, _MAX_RADII = 3.0, 8.0
 """Object radii: limits of the radius of the region of evidence; between them it is the cameras' median distance."""
-_SCENE_WITHIN = 1.4
-"""Radii of the region within which Gaussians may cast shadows."""
 _HIGHLIGHTS_WITHIN = 0.5
 """Radii of the region within which highlights count."""
 _FAR = 0.9
@@ -122,24 +117,23 @@ class EstimatedLight:
         names = [source.name for source in shown if source.name in _SEEN_NAMES]
         return names[0] if names else _UNSEEN_NAMES[float(direction.float() @ self.evidence.up) > _LAMP]
 
-    def at(self, scene: Gaussians, cameras: Cameras, place: BoundingSphere) -> "EstimatedLight | NoLight":
+    def at(self, captured: CapturedScene, place: BoundingSphere) -> "EstimatedLight | NoLight":
         """At a place in the same region: the same sources, and ambient light with what is near there."""
         if place.radius == self.place.radius and torch.equal(place.center, self.place.center):
             return self
-        scene = usable_gaussians(scene)
+        scene = captured.usable.gaussians
         panorama = panorama_at(scene, place)
         if isinstance(panorama, NoLight):
             return panorama
-        evidence = replace(self.evidence, around=place_surroundings(scene, cameras, place))
+        evidence = replace(self.evidence, around=place_surroundings(scene, captured.cameras, place))
         _, rest = _split_peaks(self.hidden.radiance(evidence), evidence, within=math.inf)
         mean = replace(self.mean, ambient=_ambient_of(rest), **_seen_shares(evidence))
         return replace(self, evidence=evidence, mean=mean)
 
 
 def estimate_light(
-    scene: Gaussians,
+    captured: CapturedScene,
     place: BoundingSphere,
-    cameras: Cameras,
     *,
     object_gaussians: Gaussians | None = None,
     sun_through: Sequence[Point] = (),
@@ -147,35 +141,31 @@ def estimate_light(
     """Estimate the light in the middle of `place`.
 
     Args:
-        scene: All Gaussians, without the object.
+        captured: The scene without the object.
         place: The object's bounding sphere.
-        cameras: Of the scene's capture.
         object_gaussians: The object itself, if it stands there: its shading and its shadow are evidence, but it is not
             part of the surroundings.
         sun_through: Points and their shadows, as for `light.sun.set_sun`: the estimate then has this sun.
     """
-    scene = usable_gaussians(scene)
+    scene, cameras = captured.usable.gaussians, captured.cameras
     panorama = panorama_at(scene, place)
     if isinstance(panorama, NoLight):
         return panorama
-    up, region = estimate_up(cameras), region_around(place, cameras)
-    whole = scene if object_gaussians is None else concatenate([scene, object_gaussians])
-    part = whole.select((whole.means - region.center).norm(dim=1) < _SCENE_WITHIN * region.radius)
-    normals = estimate_normals(part, cameras)
-    surfaces = find_shading_evidence(part, normals, region=region)
+    region = region_around(place, cameras)
+    whole = captured.usable if object_gaussians is None else captured.usable.with_object(object_gaussians)
     near = BoundingSphere(region.center, _HIGHLIGHTS_WITHIN * region.radius)
     evidence = LightEvidence(
-        surfaces=surfaces,
-        highlights=find_highlights(part, normals, cameras, region=near),
+        surfaces=find_shading_evidence(whole, region=region),
+        highlights=find_highlights(whole, region=near),
         far=surroundings_at(scene, cameras, place.center, nearest=_FAR * region.radius),
         around=place_surroundings(scene, cameras, place),
-        up=up,
+        up=captured.up,
     )
     hidden = search_radiance(radiance_problem(evidence))
     sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
     mean = with_source_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, place)
-    sun = set_sun(sun_through, whole, cameras, up) if sun_through else find_sun(whole, cameras, region, up)
+    sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
     return found if sun is None else found.with_sun(sun, scene)
 
 
@@ -183,14 +173,6 @@ def region_around(place: BoundingSphere, cameras: Cameras) -> BoundingSphere:
     """What is looked at for the light at a place, from about the distance of the cameras."""
     distance = float((cameras.centers - place.center).norm(dim=1).median())
     return BoundingSphere(place.center, max(_MIN_RADII * place.radius, min(distance, _MAX_RADII * place.radius)))
-
-
-def usable_gaussians(scene: Gaussians) -> Gaussians:
-    """The Gaussians whose values are finite and no larger than any camera or scene makes them."""
-    good = torch.ones(scene.count, dtype=torch.bool)
-    for values in (scene.means, scene.log_scales, scene.quaternions, scene.sh.flatten(1)):
-        good &= (values.abs() < _HUGE).all(1)  # false for nan too
-    return scene if bool(good.all()) else scene.select(good)
 
 
 def _seen_shares(evidence: LightEvidence) -> dict[str, float]:

@@ -18,14 +18,14 @@ from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.bounds import BoundingSphere
-from splatgraft.core.cameras import Cameras
 from splatgraft.core.directions import frames_along
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.k_means import k_means
 from splatgraft.core.spherical_harmonics import rgb_from_dc
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.panorama import DIRECTIONS, FARTHEST, nearest_directions
-from splatgraft.relighting.normals import Normals, seen_from, spread_over
+from splatgraft.relighting.normals import is_seen
 from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occluders_of, splat_depth_maps, visibility
 
 _SEED = 0
@@ -81,8 +81,6 @@ _NORMAL_UNIT = 0.6
 """Unit of normals among the features."""
 
 # highlights; set by hand
-_MAX_CAMERAS = 20
-"""Cameras, spread over the list."""
 _MAX_HIGHLIGHTS = 2000
 """Gaussians, chosen at random."""
 _MIN_HIGHLIGHTS = 200
@@ -186,14 +184,14 @@ class ShadingEvidence:
         return _transported(seen, cosine * size)
 
 
-def find_shading_evidence(scene: Gaussians, normals: Normals, *, region: BoundingSphere) -> ShadingEvidence:
+def find_shading_evidence(captured: CapturedScene, *, region: BoundingSphere) -> ShadingEvidence:
     """Receivers around a place and the transport of light to them; none where there are too few.
 
     Args:
-        scene: All Gaussians.
-        normals: Of all Gaussians.
+        captured: All Gaussians.
         region: Receivers lie within it.
     """
+    scene, normals = captured.gaussians, captured.normals
     inside = (scene.means - region.center).norm(dim=1) < region.radius
     good = inside & normals.seen & (scene.opacities > _RECEIVER_OPACITY)
     candidates = (good & (normals.confidence > _MIN_NORMAL_CONFIDENCE)).nonzero()[:, 0]
@@ -309,31 +307,28 @@ class HighlightEvidence:
         return share.max(1).values.sum(0).clamp(0, _MAX_EXPLAINED)
 
 
-def find_highlights(
-    scene: Gaussians, normals: Normals, cameras: Cameras, *, region: BoundingSphere
-) -> HighlightEvidence | None:
+def find_highlights(captured: CapturedScene, *, region: BoundingSphere) -> HighlightEvidence | None:
     """How much of the change of colours from view to view any distribution of light over the `DIRECTIONS` explains.
 
     Args:
-        scene: All Gaussians.
-        normals: Of all Gaussians.
-        cameras: Of the scene's capture.
+        captured: All Gaussians, and the cameras.
         region: Gaussians outside are left out.
 
     Returns:
         None where colours are view-independent (degree 0), or where too few Gaussians or cameras are left.
     """
+    scene, normals = captured.gaussians, captured.normals
     inside = (scene.means - region.center).norm(dim=1) < region.radius
     good = inside & normals.seen & (scene.opacities > _HIGHLIGHT_OPACITY)
     good &= normals.confidence > _HIGHLIGHT_CONFIDENCE
     chosen = good.nonzero()[:, 0]
-    if len(chosen) < _MIN_HIGHLIGHTS or scene.sh_degree == 0 or len(cameras) < _MIN_CAMERAS:
+    if len(chosen) < _MIN_HIGHLIGHTS or scene.sh_degree == 0 or len(captured.cameras) < _MIN_CAMERAS:
         return None
     chosen = chosen[_chosen(len(chosen), _MAX_HIGHLIGHTS)]
     part, facing = scene.select(chosen), normals.vectors[chosen]
-    positions = spread_over(cameras, count=_MAX_CAMERAS)
-    seen = torch.stack([seen_from(part, cameras[i], among=scene) for i in positions], 1)
-    towards = torch.nn.functional.normalize(cameras.centers[positions][None] - part.means[:, None], dim=-1)
+    seen = torch.stack([is_seen(part, camera, drawn) for camera, drawn in captured.views], 1)
+    centers = torch.cat([camera.centers for camera, _ in captured.views])
+    towards = torch.nn.functional.normalize(centers[None] - part.means[:, None], dim=-1)
     cosine = (towards * facing[:, None]).sum(-1)
     basis = spherical_harmonics.basis(-towards.reshape(-1, 3), part.sh_degree).reshape(*towards.shape[:2], -1)
     rgb = torch.einsum("mvk,mkc->mvc", basis, part.sh) + 0.5

@@ -25,15 +25,12 @@ from splatgraft.core.directions import even_directions, frames_along, tangents, 
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import LUMINANCE, linear_from_srgb
 from splatgraft.core.planes import LevelPlane, LevelPlaneOptions, dominant_level_plane
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.light import Light, LightSource
 from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occluders_of, splat_depth_maps, thinned
-from splatgraft.rendering import render
+from splatgraft.rendering import Render
 
 # the picture of the surface; set by hand
-_VIEWS, _VIEW_PX = 16, 480
-"""Cameras, spread over the list, and the longest side of what they show, pixels."""
-_GLANCES, _GLANCE_PX = 8, 160
-"""The same for the search of the surface."""
 _SIZE = 192
 """Texels, a multiple of 16: width of the picture and of the shadow maps."""
 _MAX_POINTS = 6000
@@ -148,20 +145,19 @@ class Surface:
     half: float
     """Half the width of the square, world units."""
 
-    @property
-    def texels(self) -> Float[Tensor, "s s 3"]:
-        """The middles of the texels, world units."""
+    def texels(self, every: int = 1) -> Float[Tensor, "s s 3"]:
+        """The middles of every so many texels, world units."""
         right, down = tangents(self.plane.normal)
-        x = ((torch.arange(_SIZE) + 0.5) / _SIZE * 2 - 1) * self.half
+        x = ((torch.arange(0, _SIZE, every) + 0.5) / _SIZE * 2 - 1) * self.half
         v, u = torch.meshgrid(x, x, indexing="ij")
         return self.center + u[..., None] * right + v[..., None] * down
 
-    def shadows(self, occluders: Occluders, directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k s s"]:
-        """Share of the light from each of some directions that reaches the texels past occluders above the plane."""
+    def shadows(self, occluders: Occluders, directions: Float[Tensor, "k 3"], every: int = 1) -> Float[Tensor, "k s s"]:
+        """Share of the light from each of some directions that reaches texels past occluders above the plane."""
         radius = 1.05 * self.half
         window = Window(center=self.center, radius=radius, frames=frames_along(directions))
         alpha = splat_depth_maps(occluders, window, size=_SIZE, with_color=False).alpha
-        at = torch.einsum("kij,stj->ksti", window.frames[:, :2], self.texels - self.center) / radius
+        at = torch.einsum("kij,stj->ksti", window.frames[:, :2], self.texels(every) - self.center) / radius
         return 1 - F.grid_sample(alpha[:, None], at, align_corners=False)[:, 0]
 
     def ambient(self, occluders: Occluders) -> Float[Tensor, "s s"]:
@@ -184,23 +180,15 @@ class SurfacePicture:
     """Where enough views show the surface, neither clipped nor black."""
 
 
-def find_surface(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Float[Tensor, "3"]) -> Surface | None:
-    """The level surface that most of a region shows; None where there is none.
-
-    Args:
-        scene: All Gaussians.
-        cameras: Of its capture.
-        region: The surface lies within.
-        up: Unit.
-    """
+def find_surface(captured: CapturedScene, region: BoundingSphere) -> Surface | None:
+    """The level surface that most of a region shows to the cameras; None where there is none."""
     seen = []
-    for camera in cameras.spread(_GLANCES).limited(_GLANCE_PX):
-        drawn = render(scene, camera, outputs=frozenset({"depth"}))
+    for camera, drawn in captured.views:
         points = _unprojected(camera, drawn.depth[0])
         seen.append(points[(drawn.alpha[0] > _SOLID) & ((points - region.center).norm(dim=-1) < region.radius)])
     points = torch.cat(seen)
     points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:_MAX_POINTS]]
-    plane = dominant_level_plane(points, up, options=_PLANE)
+    plane = dominant_level_plane(points, captured.up, options=_PLANE)
     if plane is None:
         return None
     on_it = points[plane.height(points).abs() < plane.thickness]
@@ -209,13 +197,9 @@ def find_surface(scene: Gaussians, cameras: Cameras, region: BoundingSphere, up:
     return Surface(plane, center, float((on_it - center).norm(dim=1).quantile(0.95)))
 
 
-def draw_surface(scene: Gaussians, cameras: Cameras, surface: Surface) -> SurfacePicture:
+def draw_surface(captured: CapturedScene, surface: Surface) -> SurfacePicture:
     """Draw a surface as the cameras of a capture show it."""
-    views = []
-    for camera in cameras.spread(_VIEWS).limited(_VIEW_PX):
-        drawn = render(scene, camera, outputs=frozenset({"color", "depth"}))
-        views.append(_seen_texels(surface, camera, linear_from_srgb(drawn.color[0].clamp(0, 1)), drawn.depth[0]))
-    colors = torch.stack(views)
+    colors = torch.stack([_seen_texels(surface, camera, drawn) for camera, drawn in captured.views])
     enough = (~colors[..., 0].isnan()).sum(0) >= _MIN_VIEWS
     log_rgb = colors.nanmedian(0).values.nan_to_num()
     linear = log_rgb.exp()
@@ -234,15 +218,14 @@ def _unprojected(camera: Cameras, depth: Float[Tensor, "h w"]) -> Float[Tensor, 
     return (camera.rays() * depth[..., None]) @ camera.world_from_camera[0, :3, :3].T + camera.centers[0]
 
 
-def _seen_texels(
-    surface: Surface, camera: Cameras, color: Float[Tensor, "h w 3"], depth: Float[Tensor, "h w"]
-) -> Float[Tensor, "s s 3"]:
+def _seen_texels(surface: Surface, camera: Cameras, drawn: Render) -> Float[Tensor, "s s 3"]:
     """Logarithm of the linear rgb that one view shows of the texels; nan where it does not show the surface there."""
-    texels, pose = surface.texels, camera.camera_from_world[0]
+    texels, pose = surface.texels(), camera.camera_from_world[0]
     local = texels @ pose[:3, :3].T + pose[:3, 3]
     away = local[..., 2].clamp_min(1e-6)
     at = (local @ camera.intrinsics[0].T)[..., :2] / away[..., None] / camera.sizes[0].to(texels) * 2 - 1
-    picture = torch.cat([color, depth[..., None]], -1).permute(2, 0, 1)
+    color = linear_from_srgb(drawn.color[0].clamp(0, 1))
+    picture = torch.cat([color, drawn.depth[0][..., None]], -1).permute(2, 0, 1)
     sampled = F.grid_sample(picture[None], at[None], align_corners=False)[0]
     rays = texels - camera.centers[0]
     distance = rays.norm(dim=-1)
@@ -258,18 +241,25 @@ def _seen_texels(
 class _Differences:
     """p pairs of texels along one axis of a picture."""
 
-    first: tuple[slice, slice]
-    second: tuple[slice, slice]
-    chosen: Bool[Tensor, "a b"]
-    """Which pairs are compared."""
+    first: Int[Tensor, "p"]
+    second: Int[Tensor, "p"]
+    """Position of each of the two texels, row by row."""
     luminance: Float[Tensor, "p"]
-    """Difference of the logarithms of luminance, second less first."""
+    """Difference of the logarithms of luminance, second less first, in units of `_NOISE`."""
     tile: Int[Tensor, "p"]
     """Tile of each pair."""
 
     def of(self, values: Float[Tensor, "k s s"]) -> Float[Tensor, "k p"]:
         """Differences of other values."""
-        return (values[:, *self.second] - values[:, *self.first])[:, self.chosen]
+        flat = values.flatten(1)
+        return flat.index_select(1, self.second) - flat.index_select(1, self.first)
+
+    def log_likelihoods(self, brightness: Float[Tensor, "k s s"]) -> Float[Tensor, "k p"]:
+        """Log likelihood of each pair under k logarithms of light, over that of even light."""
+        # ratio of two Cauchy densities, mixed with 1
+        share = (1 - _SHADED_TEXEL) * (1 + self.luminance.square())
+        off = self.of(brightness).div_(-_NOISE).add_(self.luminance)
+        return (share / off.square_().add_(1)).add_(_SHADED_TEXEL).log_()
 
 
 @dataclass(frozen=True)
@@ -279,35 +269,38 @@ class _Comparison:
     apart: int
     step: int
     """Texels between one pair and the next; about `apart` squared pairs tell the same."""
+    every: int
+    """All of these texels are at multiples of it: what is compared has every so many alone."""
     axes: tuple[_Differences, _Differences]
 
     @staticmethod
     def of(picture: SurfacePicture, apart: int, step: int | None = None) -> "_Comparison":
         """Compare what may be of one material in sun and shade, at every `step`; None: half of `apart`."""
-        log_luminance = (picture.log_rgb.exp() @ LUMINANCE).log()
-        red, green, blue = picture.log_rgb.unbind(-1)
-        chroma = torch.stack([(green - 0.5 * (red + blue)) / _MAX_GREEN, (red - blue) / _MAX_RED], -1)
-        tile = torch.arange(_SIZE) * _TILES // _SIZE
-        tile = tile[:, None] * _TILES + tile
         step = step or max(2, apart // 2)
-        whole, low, high = slice(None, None, step), slice(0, _SIZE - apart, step), slice(apart, _SIZE, step)
+        every = step if apart % step == 0 else 1
+        log_rgb, valid = picture.log_rgb[::every, ::every], picture.valid[::every, ::every]
+        log_luminance = (log_rgb.exp() @ LUMINANCE).log()
+        red, green, blue = log_rgb.unbind(-1)
+        chroma = torch.stack([(green - 0.5 * (red + blue)) / _MAX_GREEN, (red - blue) / _MAX_RED], -1)
+        tile = torch.arange(0, _SIZE, every) * _TILES // _SIZE
+        tile = tile[:, None] * _TILES + tile
+        skip, gap = step // every, apart // every
+        whole, low, high = slice(None, None, skip), slice(0, len(tile) - gap, skip), slice(gap, None, skip)
+        position = torch.arange(tile.numel()).reshape(tile.shape)
 
         def along(first: tuple[slice, slice], second: tuple[slice, slice]) -> _Differences:
             same = (chroma[second] - chroma[first]).abs().amax(-1) < 1
-            chosen = picture.valid[first] & picture.valid[second] & same
-            change = (log_luminance[second] - log_luminance[first])[chosen]
-            return _Differences(first, second, chosen, change, tile[first][chosen])
+            chosen = valid[first] & valid[second] & same
+            change = (log_luminance[second] - log_luminance[first])[chosen] / _NOISE
+            return _Differences(position[first][chosen], position[second][chosen], change, tile[first][chosen])
 
-        return _Comparison(apart, step, (along((whole, low), (whole, high)), along((low, whole), (high, whole))))
+        return _Comparison(apart, step, every, (along((whole, low), (whole, high)), along((low, whole), (high, whole))))
 
     def log_likelihoods(self, irradiance: Float[Tensor, "k s s"]) -> Float[Tensor, "k"]:
         """Log likelihood of k patterns of light on the surface, in any unit, over that of even light."""
         brightness, by_tile = irradiance.log(), torch.zeros(len(irradiance), _TILES**2)
         for one in self.axes:
-            even = 1 / (1 + (one.luminance / _NOISE) ** 2)
-            lit = 1 / (1 + ((one.luminance - one.of(brightness)) / _NOISE) ** 2)
-            mixed = (1 - _SHADED_TEXEL) * lit + _SHADED_TEXEL * even
-            by_tile.index_add_(1, one.tile, (mixed / even).log())
+            by_tile.index_add_(1, one.tile, one.log_likelihoods(brightness))
         shown = by_tile * (self.step / self.apart) ** 2 + math.log(1 - _SHADED_TILE)
         return torch.logaddexp(shown, torch.tensor(math.log(_SHADED_TILE))).sum(1)
 
@@ -324,22 +317,18 @@ class _Comparison:
         return torch.stack([self.log_likelihoods(ambient + s * visible) for s in strengths]).amax(0)
 
 
-def find_sun(
-    scene: Gaussians, cameras: Cameras, region: BoundingSphere, up: Float[Tensor, "3"], *, decisive: float = _DECISIVE
-) -> Sun | None:
+def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float = _DECISIVE) -> Sun | None:
     """Find the sun whose shadows a level surface shows; None where none is decisively better than no sun.
 
     Args:
-        scene: All Gaussians, with everything that cast shadows when the scene was captured.
-        cameras: Of its capture.
+        captured: With everything that cast shadows when the scene was captured.
         region: Around the place; the surface and what stands on it lie within.
-        up: Unit.
         decisive: Least evidence.
     """
-    surface = find_surface(scene, cameras, region, up)
+    surface = find_surface(captured, region)
     if surface is None:
         return None
-    standing, picture = standing_on(surface, scene, region), draw_surface(scene, cameras, surface)
+    standing, picture = standing_on(surface, captured.gaussians, region), draw_surface(captured, surface)
     if not len(standing.means) or int(picture.valid.sum()) < _MIN_TEXELS:
         return None
     coarse, fine = _Comparison.of(picture, _COARSE), _Comparison.of(picture, _FINE)
@@ -348,7 +337,9 @@ def find_sun(
     without = max(0.0, float(fine.log_likelihoods(blurred_ambient)))
     directions = _DIRECTIONS[_DIRECTIONS @ normal > _LOWEST]
     parts = directions.split(_AT_ONCE)
-    score = torch.cat([coarse.of_suns(surface.shadows(standing, part), ambient, _STRENGTHS) for part in parts])
+    some = coarse.every
+    at_some, shadows = ambient[::some, ::some], (surface.shadows(standing, part, some) for part in parts)
+    score = torch.cat([coarse.of_suns(visible, at_some, _STRENGTHS) for visible in shadows])
     best, evidence = directions[0], -math.inf
     for _ in range(_MODES):
         if float(score.max()) < _PROMISING:
@@ -371,7 +362,7 @@ def find_sun(
     return Sun(best, radius, normal, ratio, evidence)
 
 
-def set_sun(points: Sequence[Point], scene: Gaussians, cameras: Cameras, up: Float[Tensor, "3"]) -> Sun:
+def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
     """The sun that throws the shadows of some points where someone says that they lie.
 
     Its direction is the mean over the pairs, its error their spread. Radius and strength are measured at the edges of
@@ -379,9 +370,7 @@ def set_sun(points: Sequence[Point], scene: Gaussians, cameras: Cameras, up: Flo
 
     Args:
         points: Pairs, world units: a point of what casts a shadow, then the same point of its shadow.
-        scene: All Gaussians, with what casts the shadows.
-        cameras: Of its capture.
-        up: Unit.
+        captured: With what casts the shadows.
 
     Raises:
         ValueError: The points are no pairs, or a shadow lies higher than what casts it.
@@ -390,7 +379,7 @@ def set_sun(points: Sequence[Point], scene: Gaussians, cameras: Cameras, up: Flo
     if len(pairs) % 2 or not len(pairs):
         raise ValueError(f"sun_through: expected pairs of a point and its shadow, found {len(pairs)} points")
     casters, shadows = pairs[::2], pairs[1::2]
-    towards = F.normalize(casters - shadows, dim=1)
+    towards, up = F.normalize(casters - shadows, dim=1), captured.up
     if float((towards @ up).min()) < _LOWEST:
         i = int((towards @ up).argmin())
         height = float((casters[i] - shadows[i]) @ up)
@@ -403,10 +392,10 @@ def set_sun(points: Sequence[Point], scene: Gaussians, cameras: Cameras, up: Flo
     by_hand = Sun(direction, _UNSEEN_RADIUS_DEG, up, None, math.inf, max(_ERROR_DEG, float(spread)), SET_BY_HAND)
     for caster, shadow in zip(casters, shadows, strict=True):
         region = BoundingSphere(shadow, _AROUND_SHADOW * float((caster - shadow).norm()))
-        surface = find_surface(scene, cameras, region, up)
+        surface = find_surface(captured, region)
         if surface is None or float(direction @ surface.plane.normal) < _LOWEST:
             continue
-        standing, picture = standing_on(surface, scene, region), draw_surface(scene, cameras, surface)
+        standing, picture = standing_on(surface, captured.gaussians, region), draw_surface(captured, surface)
         radius, ratio = _radius_and_ratio(picture, standing, surface.ambient(standing), direction)
         if ratio is not None and float(ratio @ LUMINANCE) > 0:
             return replace(by_hand, radius_deg=radius, normal=surface.plane.normal, ratio=ratio)
@@ -469,8 +458,9 @@ def lit_over_shaded(
         edge = one.of(visible[None])[0]
         across = edge.abs() > _EDGE
         sign = edge[across].sign()
-        change = (picture.log_rgb[one.second] - picture.log_rgb[one.first])[one.chosen][across] * sign[:, None]
-        first, second = (ambient[side][one.chosen][across] for side in (one.first, one.second))
+        log_first, log_second = (picture.log_rgb.reshape(-1, 3)[side[across]] for side in (one.first, one.second))
+        change = (log_second - log_first) * sign[:, None]
+        first, second = (ambient.flatten()[side[across]] for side in (one.first, one.second))
         lit, shaded = torch.where(sign > 0, second, first), torch.where(sign > 0, first, second)
         ratios.append(change.exp() * shaded[:, None] - lit[:, None])
     found = torch.cat(ratios)

@@ -1,0 +1,86 @@
+"""A scene with the cameras of its capture: what they see of it, drawn when it is first asked for and then kept.
+
+Of all that the light at a place is found from, this alone does not depend on the place.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.relighting.normals import Normals, estimate_normals
+from splatgraft.rendering import Render, render
+
+_VIEWS, _VIEW_PX = 16, 480
+"""Cameras, spread over the list, and the longest side of what is drawn in them, pixels; set by hand."""
+_NEAREST = 1e-6
+"""World units in front of a camera; what is nearer is not drawn."""
+_HUGE = 1e6
+"""World units, and units of colour; larger Gaussians are a format's or an optimiser's fault."""
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedScene:
+    """The n Gaussians of a scene and the cameras of its capture."""
+
+    gaussians: Gaussians
+    """All of them."""
+    cameras: Cameras
+
+    @cached_property
+    def up(self) -> Float[Tensor, "3"]:
+        """Unit."""
+        return estimate_up(self.cameras)
+
+    @cached_property
+    def usable(self) -> "CapturedScene":
+        """With the Gaussians alone whose values are finite and no larger than any camera or scene makes them."""
+        good = _are_usable(self.gaussians)
+        return self if bool(good.all()) else CapturedScene(self.gaussians.select(good), self.cameras)
+
+    @cached_property
+    def normals(self) -> Normals:
+        """Of all Gaussians, towards the cameras; without any confidence where a Gaussian is not usable."""
+        if self.usable is self:
+            return estimate_normals(self.gaussians, self.cameras, views=self.views)
+        good, found = _are_usable(self.gaussians), self.usable.normals
+        whole = Normals(
+            vectors=torch.tensor([0.0, 0.0, 1.0]).repeat(len(good), 1),
+            confidence=torch.zeros(len(good)),
+            seen=torch.zeros(len(good), dtype=torch.bool),
+        )
+        whole.vectors[good], whole.confidence[good], whole.seen[good] = found.vectors, found.confidence, found.seen
+        return whole
+
+    @cached_property
+    def views(self) -> tuple[tuple[Cameras, Render], ...]:
+        """Colour and depth of the scene in some of the cameras, each with one view.
+
+        The depth is the inverse of the mean nearness: what is far behind a surface that lets a little light through
+        hardly moves it.
+        """
+        return tuple((one, self._drawn(one)) for one in self.cameras.spread(_VIEWS).limited(_VIEW_PX))
+
+    def _drawn(self, camera: Cameras) -> Render:
+        pose = camera.camera_from_world[0]
+        away = self.gaussians.means @ pose[2, :3] + pose[2, 3]
+        nearness = torch.where(away > _NEAREST, 1 / away.clamp_min(_NEAREST), 0.0)
+        drawn = render(self.gaussians, camera, features=nearness[:, None])
+        depth = drawn.alpha / drawn.features[..., 0].clamp_min(1 / _HUGE)
+        return replace(drawn, pictures={"color": drawn.color, "depth": depth})
+
+    def with_object(self, thing: Gaussians) -> "CapturedScene":
+        """With an object that stands in it; its Gaussians come last."""
+        return CapturedScene(concatenate([self.gaussians, thing]), self.cameras)
+
+
+def _are_usable(gaussians: Gaussians) -> Bool[Tensor, "n"]:
+    good = torch.ones(gaussians.count, dtype=torch.bool)
+    for values in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh.flatten(1)):
+        good &= (values.abs() < _HUGE).all(1)  # false for nan too
+    return good
