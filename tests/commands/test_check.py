@@ -117,8 +117,13 @@ def test_photos_in_no_order_hang_together_by_whatever_shows_the_same_place(
     # each shows what two or three others show
     photos = [wall[:height, 150 * i : 150 * i + width] for i in np.random.default_rng(1).permutation(COUNT)]
     photos[3] = np.rot90(photos[3])  # held on its side, which is no other camera
-    _, findings, verdict = check(save(tmp_path / "photos", photos), capsys)
-    assert (verdict, findings["overlap"]["level"], findings["sizes"]["level"]) == ("good", "good", "good")
+    assert main(["check", str(save(tmp_path / "photos", photos)), "--json"]) == 0
+    printed = capsys.readouterr()
+    found = json.loads(printed.out)
+    levels = {finding["subject"]: finding["level"] for finding in found["findings"]}
+    assert (found["verdict"], levels["overlap"], levels["sizes"]) == ("good", "good", "good")
+    # which takes longest of all
+    assert "looking for partners" in printed.err
 
 
 def test_one_photo_many_times_and_pictures_of_nothing_in_common_are_not_usable(

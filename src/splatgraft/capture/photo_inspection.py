@@ -128,11 +128,11 @@ def find_in_photos(
         for step in range(1, min(_NEIGHBOURS, n - 1) + 1):
             match(index, (index + step) % n)
         progress(index + 1, n, "comparing neighbours")
-    for group in _groups(n, found)[1:]:
-        others = [i for i in range(n) if i not in group]
-        for i in group:
-            for j in _partners(features, i, others):
-                match(i, j)
+    apart = [(i, group) for group in _groups(n, found)[1:] for i in group]
+    for done, (i, group) in enumerate(apart, 1):
+        for j in _partners(features, i, [k for k in range(n) if k not in group]):
+            match(i, j)
+        progress(done, len(apart), "looking for partners")
     links = [link for pair, link in found.items() if link is not None and pair[1] - pair[0] <= _NEIGHBOURS]
     overlap = _overlap(found, names)
     if has_poses and overlap.level != "good":
