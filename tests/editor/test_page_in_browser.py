@@ -35,7 +35,7 @@ from splatgraft.editor.session import Session
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
 from splatgraft.project.toml_edit import with_keys
-from splatgraft.relighting import LightSource, light_to_json
+from splatgraft.relighting import LightSource
 from splatgraft.relighting.light.sun import SET_BY_HAND
 
 PANEL_PX = 372
@@ -137,9 +137,6 @@ def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window
 
 
 def test_a_light_is_dragged_on_the_picture_of_the_sky(browser: Any, project: Path) -> None:
-    # surroundings of one plane are too little to estimate a light from: one is given
-    (project.parent / "light.json").write_text(light_to_json(LIGHT))
-    project.write_text(with_keys(project.read_text(), "relight", {"given_light": "light.json"}))
 
     def height() -> float:
         light = state_of(project).light
@@ -167,9 +164,6 @@ def test_a_light_is_dragged_on_the_picture_of_the_sky(browser: Any, project: Pat
 
 @pytest.mark.long
 def test_an_arrow_of_the_light_is_dragged_under_drafts(browser: Any, project: Path) -> None:
-    # surroundings of one plane are too little to estimate a light from: one is given
-    (project.parent / "light.json").write_text(light_to_json(LIGHT))
-    project.write_text(with_keys(project.read_text(), "relight", {"given_light": "light.json"}))
     # a small object has short arrows, which are in view
     session = Session(Project(project))
     session.set_placement(0, rescale(session.placeable_object(0), session.objects()[0].target_from_object, 0.15))
@@ -226,8 +220,6 @@ def set_the_sun(window: Window, page: Page, pairs: Sequence[tuple[torch.Tensor, 
 def test_two_clicks_set_the_sun_and_undo_takes_it_back(browser: Any, tmp_path: Path) -> None:
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     project = scene_project(tmp_path, target=sunlit_scene(sun, 3.0))
-    (project.parent / "light.json").write_text(light_to_json(LIGHT))
-    project.write_text(with_keys(project.read_text(), "relight", {"given_light": "light.json"}))
     assert main(["run", str(project), "--to", "compose"]) == 0
     tops = torch.tensor([[1.0, 0.2, 0.5], [-0.7, -0.8, 0.5]])
     with opened_page(project) as page:

@@ -50,6 +50,7 @@ def test_the_true_light_takes_most_of_the_shadows_error_and_colours_alone_none(t
     assert values["reinhard"]["shadow_ratio_rmse"] > 0.9 * values["copy-paste"]["shadow_ratio_rmse"]
 
 
+@pytest.mark.long
 def test_the_truth_as_another_programs_pictures_has_no_error_left(measured):
     values, _ = rows(measured)
     assert values["truth"]["ssim_whole"] == pytest.approx(1)
@@ -60,6 +61,7 @@ def test_the_truth_as_another_programs_pictures_has_no_error_left(measured):
     assert values["truth"]["psnr_whole"] is None
 
 
+@pytest.mark.long
 def test_measured_views_were_held_out_of_everything(measured):
     work = measured.out / "scenes" / "terrace"
     held = {f"{i:04d}" for i in (0, 8, 16)}
@@ -75,6 +77,7 @@ def test_measured_views_were_held_out_of_everything(measured):
         assert set(json.loads(metrics.read_text())["views"]) == held
 
 
+@pytest.mark.long
 def test_what_could_not_run_or_be_measured_is_said_and_never_filled(measured):
     _, found = rows(measured)
     assert any("off+nosuch on terrace not run: harmonizer: expected one of" in line for line in found["not_run"])
@@ -89,6 +92,7 @@ def test_what_could_not_run_or_be_measured_is_said_and_never_filled(measured):
     assert "https://" not in page
 
 
+@pytest.mark.long
 def test_a_second_run_measures_nothing_again(measured):
     files = sorted(measured.out.glob("scenes/terrace/*/**/metrics.json"))
     before = {path: path.stat().st_mtime_ns for path in files}
@@ -122,6 +126,7 @@ def test_a_folder_without_scenes_is_one_line(tmp_path, capsys):
     assert "expected scenes with ground_truth/, found none" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_pictures_that_lack_a_held_out_view_are_named(tmp_path, measured):
     theirs = tmp_path / "theirs" / "terrace"
     theirs.mkdir(parents=True)

@@ -81,6 +81,7 @@ def test_the_true_map_on_a_mirror_gives_the_true_picture():
     assert float(psnr(scene.picture(camera), truth, inside)) > 25
 
 
+@pytest.mark.long
 def test_a_mirror_is_found_and_held_out_views_show_it(fitted):
     cameras, scene = fitted
     camera = cameras[0]
@@ -94,6 +95,7 @@ def test_a_mirror_is_found_and_held_out_views_show_it(fitted):
     assert float(psnr(scene.picture(camera).detach(), truth, inside)) > float(psnr(flat, truth, inside)) + 8
 
 
+@pytest.mark.long
 def test_inserted_it_shows_the_environment_of_its_new_place(fitted):
     cameras, scene = fitted
     camera = cameras[0]
