@@ -35,11 +35,23 @@ from splatgraft.editor.session import Session
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.formats.placement import read_placement
 from splatgraft.project.toml_edit import with_keys
-from splatgraft.relighting import LightSource
+from splatgraft.relighting import LightSource, light_to_json
 from splatgraft.relighting.light.sun import SET_BY_HAND
 
 PANEL_PX = 372
 DRAFT = "a draft of the light"
+
+
+def with_given_light(project: Path) -> Path:
+    """Surroundings of one plane are too little to estimate a light from."""
+    (project.parent / "light.json").write_text(light_to_json(LIGHT))
+    project.write_text(with_keys(project.read_text(), "relight", {"given_light": "light.json"}))
+    return project
+
+
+@pytest.fixture
+def project(project: Path) -> Path:
+    return with_given_light(project)
 
 
 def screen(window: Window) -> np.ndarray:
@@ -219,7 +231,7 @@ def set_the_sun(window: Window, page: Page, pairs: Sequence[tuple[torch.Tensor, 
 
 def test_two_clicks_set_the_sun_and_undo_takes_it_back(browser: Any, tmp_path: Path) -> None:
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
-    project = scene_project(tmp_path, target=sunlit_scene(sun, 3.0))
+    project = with_given_light(scene_project(tmp_path, target=sunlit_scene(sun, 3.0)))
     assert main(["run", str(project), "--to", "compose"]) == 0
     tops = torch.tensor([[1.0, 0.2, 0.5], [-0.7, -0.8, 0.5]])
     with opened_page(project) as page:
