@@ -384,9 +384,12 @@ def test_hands_move_turn_size_and_lift_the_object(window: Window, page: Page) ->
     def placed() -> Any:
         return session.objects()[0].target_from_object
 
+    def version() -> str:
+        return window.page.evaluate("document.querySelector('.sg-state').dataset.version")
+
     def hand(key: str | None, by: tuple[float, float]) -> Any:
-        """Drag the object, and wait until it is placed; gives the placement before."""
-        before, start = placed(), middle_of_the_object(window)
+        """Drag the object, and wait until it is placed and seen there; gives the placement before."""
+        before, start, shown = placed(), middle_of_the_object(window), version()
         if key is not None:
             window.page.keyboard.press(key)
         window.drag(start, by, release=False)
@@ -395,7 +398,7 @@ def test_hands_move_turn_size_and_lift_the_object(window: Window, page: Page) ->
         assert placed() is before
         window.page.mouse.up()
         window.until(lambda: placed() is not before, what="a new placement")
-        wait_for_the_full_light(window)
+        window.until(lambda: version() != shown, what="a picture of it")
         return before
 
     before = hand(None, (60, 30))
