@@ -20,8 +20,7 @@ from splatgraft.formats import is_scene, read_cameras, read_gaussians
 from splatgraft.project.layout import CAMERAS_FILE, PROJECT_FILE, SCENE_FILE
 from splatgraft.project.step import Positional
 from splatgraft.relighting.captured_scene import CapturedScene
-from splatgraft.relighting.light.environment import environment_radiance, equirectangular_directions
-from splatgraft.relighting.light.estimate import estimate_light
+from splatgraft.relighting.light.estimate import environment_radiance, equirectangular_directions, estimate_light
 from splatgraft.relighting.light.light import Light, light_to_json
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.scene_light import place_of

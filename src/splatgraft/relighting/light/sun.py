@@ -337,9 +337,9 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
     without = max(0.0, float(fine.log_likelihoods(blurred_ambient)))
     directions = _DIRECTIONS[_DIRECTIONS @ normal > _LOWEST]
     parts = directions.split(_AT_ONCE)
-    some = coarse.every
-    at_some, shadows = ambient[::some, ::some], (surface.shadows(standing, part, some) for part in parts)
-    score = torch.cat([coarse.of_suns(visible, at_some, _STRENGTHS) for visible in shadows])
+    every = coarse.every
+    visible = (surface.shadows(standing, part, every) for part in parts)
+    score = torch.cat([coarse.of_suns(one, ambient[::every, ::every], _STRENGTHS) for one in visible])
     best, evidence = directions[0], -math.inf
     for _ in range(_MODES):
         if float(score.max()) < _PROMISING:
