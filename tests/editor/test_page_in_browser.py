@@ -149,7 +149,6 @@ def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window
 
 
 def test_a_light_is_dragged_on_the_picture_of_the_sky(browser: Any, project: Path) -> None:
-
     def height() -> float:
         light = state_of(project).light
         return 0.0 if light is None else light.sources[0].direction[2]

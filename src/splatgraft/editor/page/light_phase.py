@@ -186,21 +186,25 @@ class LightPhase(Phase):
 
     def _scale_source(self) -> None:
         factor = float(self._strength.value)
-        r, g, b = (factor * value for value in self._full[self._index()])
-        self._change_source(lambda source: replace(source, irradiance=(r, g, b)))
+
+        def scaled(source: LightSource, index: int) -> LightSource:
+            r, g, b = (factor * value for value in self._full[index])
+            return replace(source, irradiance=(r, g, b))
+
+        self._change_source(scaled)
 
     def _soften(self) -> None:
         degrees = float(self._softness.value)
-        self._change_source(lambda source: replace(source, angular_radius_deg=degrees, uncertainty_deg=0.0))
+        self._change_source(lambda source, _: replace(source, angular_radius_deg=degrees, uncertainty_deg=0.0))
 
-    def _change_source(self, change: Callable[[LightSource], LightSource]) -> None:
-        """Change the chosen source; the strengths stay relative to what they were."""
+    def _change_source(self, change: Callable[[LightSource, int], LightSource]) -> None:
+        """Change the chosen source, given with its number; the strengths stay relative to what they were."""
         session = self._context.require_session()
         light = self._light(session) if session.objects() else None
-        if light is None:
+        if light is None or not light.sources:
             return
-        index = self._index()
-        edited = _with_source(light, index, change(light.sources[index]))
+        index = min(self._index(), len(light.sources) - 1)
+        edited = _with_source(light, index, change(light.sources[index], index))
         self._scaled = edited.sources
         session.change(replace(session.placed_state(), light=edited))
 

@@ -175,6 +175,8 @@ class PreviewPanel:
     def introduce(self, window: viser.ClientHandle) -> None:
         """Tell the script of the window that edits its number, before there is any picture."""
         with self._telling:
+            clients = self._context.server.get_clients()
+            self._told = {number: told for number, told in self._told.items() if number in clients}
             # a picture may have come first
             if window.client_id not in self._told:
                 self._write(window, {"window": window.client_id, "hulls": []})
@@ -385,7 +387,6 @@ class PreviewPanel:
 
     def _write(self, window: viser.ClientHandle, state: Mapping[str, object]) -> None:
         if window.client_id not in self._context.server.get_clients():
-            self._told.pop(window.client_id, None)
             return
         self._version += 1
         text = html.escape(json.dumps(state))
