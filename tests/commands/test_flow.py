@@ -101,7 +101,7 @@ def test_each_step_also_takes_paths_and_makes_the_same(project: Path, tmp_path: 
     words = ["segment", "--scene", scene, "--capture", capture, "--threshold", "0.5", "--solidify", "4"]
     assert main([*words, "--out", str(tmp_path / "object")]) == 0
     assert contents(tmp_path / "object") == contents(layout.object)
-    words = ["reconstruct", capture, "--iterations", "60", "--budget", "400", "--sh-degree", "1"]
+    words = ["reconstruct", capture, "--quality", "draft", "--iterations", "60", "--budget", "400", "--sh-degree", "1"]
     assert main([*words, "--out", str(tmp_path / "scene")]) == 0
     assert contents(tmp_path / "scene") == contents(layout.scene("source"))
 
@@ -221,7 +221,7 @@ def test_a_killed_process_leaves_earlier_results_whole_and_the_next_run_finishes
 
 HANGS_AT_A_CHECKPOINT = """
 import os, sys, time
-import splatgraft.consolidation.color_fit as color_fit, splatgraft.reconstruction.fit as fit
+import splatgraft.consolidation.color_fit as color_fit, splatgraft.fitting.gaussian_fit as fit
 from splatgraft.cli import main
 
 fit._CHECKPOINT_SECONDS, color_fit._SAVE_EVERY = 0.0, 8
@@ -271,7 +271,7 @@ def test_a_killed_training_goes_on_from_its_checkpoint(project: Path, monkeypatc
     flow = read_flow(project)
     folder, wanted = flow.layout.scene("source"), contents(flow.layout.scene("source"))
     shutil.rmtree(folder)
-    monkeypatch.setattr("splatgraft.reconstruction.fit._CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("splatgraft.fitting.gaussian_fit._CHECKPOINT_SECONDS", 0.0)
     saves = 0
 
     def save(self: FolderCheckpoint, state: dict) -> None:

@@ -60,7 +60,12 @@ def test_what_a_draft_took_is_not_what_a_better_one_takes(tmp_path: Path) -> Non
         (step.out / "step.json").write_text(json.dumps(asdict(record)))
     again = seconds(tmp_path, reconstruct='quality = "draft"')
     assert again["source/reconstruct"] == draft["source/reconstruct"]
-    assert seconds(tmp_path, reconstruct='quality = "high"')["source/reconstruct"] > 10 * draft["source/reconstruct"]
+    high = seconds(tmp_path, reconstruct='quality = "high"')
+    assert high["target/reconstruct"] > 10 * draft["target/reconstruct"]
+    # the object is fitted by itself
+    assert high["source/reconstruct"] == draft["source/reconstruct"]
+    boxed = seconds(tmp_path, reconstruct='quality = "high"', segment='mask_source = "box"')
+    assert boxed["source/reconstruct"] > 10 * draft["source/reconstruct"]
 
 
 def test_a_capture_that_was_posed_does_not_make_the_rest_seem_slow(tmp_path: Path) -> None:

@@ -59,7 +59,10 @@ def test_a_first_transfer_needs_nothing_but_two_captures(
     assert main(["try", *captures, "--keep-closed"]) == 0
     again = capsys.readouterr().err
     assert "opened" not in again
-    assert again.index("the draft; the same at standard quality follows") < again.index("source/reconstruct   begins")
+    assert again.index("the draft; the place at standard quality follows") < again.index("target/reconstruct   begins")
+    # the object was fitted to its photographs already
+    assert "source/reconstruct   begins" not in again
+    assert "segment              begins" not in again
     assert "capture       begins" not in again
     assert 'finer: quality = "high"' in again
     assert tomllib.loads(toml.read_text())["reconstruct"]["quality"] == "standard"

@@ -64,7 +64,7 @@ def test_held_out_views_are_found_again(capture):
 
 @pytest.mark.parametrize("more", [False, True], ids=["draft", "with all that standard adds"])
 def test_a_killed_reconstruction_resumes_bit_for_bit(capture, monkeypatch, more):
-    monkeypatch.setattr("splatgraft.reconstruction.fit._CHECKPOINT_SECONDS", -1.0)
+    monkeypatch.setattr("splatgraft.fitting.gaussian_fit._CHECKPOINT_SECONDS", -1.0)
     monkeypatch.setattr(SURROUNDINGS, lambda images, background: True)
     options = ReconstructOptions("standard" if more else "draft", iterations=60, budget=220, sh_degree=1, seed=5)
     whole = reconstruct(capture, options)

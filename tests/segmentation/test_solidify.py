@@ -23,7 +23,9 @@ def glassy(ball, wall):
 def test_solid_inside_and_gone_outside(glassy, cameras, photographs, masks):
     selection = torch.arange(glassy.count) <= BALL
     views = list(zip(photographs, masks, strict=True))
-    solid = solidify_object(glassy, selection, cameras, views, options=SolidifyOptions(iterations=200))
+    solid = solidify_object(
+        glassy, selection, cameras, views, options=SolidifyOptions(iterations=200, pixels_per_gaussian=0.0)
+    )
     inside = torch.nn.functional.avg_pool2d(torch.stack(masks)[:, None], 5, 1, 2)[:, 0] == 1
     outside = torch.nn.functional.max_pool2d(torch.stack(masks)[:, None], 5, 1, 2)[:, 0] == 0
     before, after = render(glassy.select(selection), cameras).alpha, render(solid, cameras).alpha
@@ -70,7 +72,7 @@ def test_what_no_photograph_shows_gets_the_colour_of_what_is_beside_it(scene, ba
     spotted = replace(scene, sh=torch.where(painted[:, None, None], red, scene.sh), log_scales=scene.log_scales + wide)
     pictures = [photo * mask[..., None] for photo, mask in zip(render(scene, cameras).color, masks, strict=True)]
     views = list(zip(pictures, masks, strict=True))
-    options, is_ball = SolidifyOptions(iterations=20, pixels_per_gaussian=0.0), torch.arange(scene.count) < BALL
+    options, is_ball = SolidifyOptions(iterations=60, pixels_per_gaussian=0.0), torch.arange(scene.count) < BALL
     solid = solidify_object(spotted, is_ball, cameras, views, options=options)
     monkeypatch.setattr("splatgraft.segmentation.solidify._HIDDEN", 0.0)
     kept = solidify_object(spotted, is_ball, cameras, views, options=options)

@@ -29,9 +29,9 @@ _FINER = {"draft": "standard", "standard": "high"}
 
 @dataclass(frozen=True)
 class Try:
-    """Run the whole flow on two captures with nothing to decide first: a draft, whose report opens, then again at
-    standard quality, which replaces it. The same command goes on after an interruption. Poses that are not plausible
-    are used and said to be so."""
+    """Run the whole flow on two captures with nothing to decide first: a draft, whose report opens, then again with
+    the place at standard quality, which replaces it. The same command goes on after an interruption. Poses that are not
+    plausible are used and said to be so."""
 
     object: Positional
     """The capture with the object: photos (a folder or a .zip), a video, a COLMAP folder, a folder with
@@ -55,7 +55,7 @@ class Try:
         if not self.keep_closed and open_page(page):
             console.say(f"{page}: opened in the browser")
         if _quality(project) == "draft" and not self.draft:
-            console.say(f"{page}: the draft; the same at standard quality follows and replaces it, or Ctrl-C keeps it")
+            console.say(f"{page}: the draft; the place at standard quality follows and replaces it, or Ctrl-C keeps it")
             with atomic_write(project) as stream:
                 stream.write(with_keys(project.read_text(), "reconstruct", {"quality": _FINER["draft"]}).encode())
             run_steps(project, console, accept_doubtful=True)
@@ -125,8 +125,9 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
 
 
 def _quality(project: Path) -> str | None:
-    """Of its reconstructions; None where the file does not say."""
-    return read_toml(project).get("reconstruct", {}).get("quality")
+    """Of the place's reconstruction; None where the file does not say, or the place is a trained scene."""
+    content = read_toml(project)
+    return None if "scene" in content["target"] else content.get("reconstruct", {}).get("quality")
 
 
 def _more(sentences: list[str]) -> str:

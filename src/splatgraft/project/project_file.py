@@ -25,8 +25,8 @@ TEMPLATE = """\
 [target]
 {target}
 
-# [source.reconstruct]       # for one capture alone; [reconstruct] is for both
-# iterations = 7000
+# [target.reconstruct]       # for one capture alone; [reconstruct] is for both, but a source is a draft unless
+# iterations = 7000          # [source.reconstruct] says otherwise: the object is fitted again by itself
 
 # [reconstruct]
 # iterations = 3000
@@ -73,18 +73,28 @@ class ProjectFile:
     def step(self, kind: type[T], given: Mapping[str, Path] | None = None, *, out: Path, side: Side | None = None) -> T:
         """Build the step `kind` from its table, which has the class's name in lower case.
 
-        Paths in the table replace the default ones in `given`, by field; the table of `side` takes precedence.
+        Paths in the table replace the default ones in `given`, by field; the table of `side` takes precedence. A source
+        whose object is fitted again is a draft unless its own table gives a quality.
         """
         name = kind.__name__.lower()
         values, where = dict(self.content.get(name, {})), f"{self.path} [{name}]"
         if side is not None:
             own = self.content[side]
             is_capture = name == "capture"
+            if side == "source" and name == "reconstruct" and self._object_is_fitted:
+                values |= {"quality": "draft"}
             values |= self._of_capture(side) if is_capture else own.get(name, {})
             where = f"{self.path} [{side}]" if is_capture else where
         # a path in the table replaces the default one, so that a step can read other files; results keep their folders
         layout = {key: path for key, path in (given or {}).items() if key not in values} | {"out": out}
         return from_table(kind, Table(values, where, self.path.parent), layout)
+
+    @property
+    def _object_is_fitted(self) -> bool:
+        """Whether `segment` fits the object to its photographs again: finer than a reconstruction of all that they show
+        would, and in less time (docs/results.md)."""
+        segment = self.content.get("segment", {})
+        return segment.get("mask_source") != "box" and segment.get("solidify") != 0
 
     def scene(self, side: Side) -> Path | None:
         """The trained scene of a side, where one is named."""

@@ -6,7 +6,7 @@ fraction of their cost.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, UInt8
@@ -15,27 +15,9 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import resize
 from splatgraft.core.posed_images import PosedImages
+from splatgraft.fitting.gaussian_fit import MIN_SIDE_PX, View
 from splatgraft.reconstruction.options import Sampling
 from splatgraft.runtime.progress import Progress
-
-_LOW_PASS_PX2 = 0.3
-"""Low pass of the photographs' pixels, as in rendering (3DGS)."""
-_COPRIME = 3
-"""Step through the cells of a stride: visits go through all of them, for strides of 2 and 4."""
-_MIN_SIDE_PX = 32
-"""Smallest side of a reduced image, pixels: below it the 11-pixel window of SSIM covers most of the image."""
-
-
-@dataclass(frozen=True)
-class View:
-    """One camera and its target image."""
-
-    camera: Cameras
-    """A batch of one."""
-    image: Float[Tensor, "h w 3"]
-    """sRGB."""
-    low_pass_px2: float | None = None
-    """Low pass of the rendering where it is not that of the fit's options, pixels squared."""
 
 
 @dataclass(frozen=True)
@@ -72,26 +54,8 @@ class Pyramid:
     def at(self, index: int, *, visit: int, done: float) -> View:
         """View `index` when it is seen for the time `visit` (from 0), after the share `done` in [0, 1] of all steps."""
         level = next((level for level in self.levels if done < level.sampling.until), self.levels[-1])
-        camera, image, stride = level.cameras[index], level.images[index], level.sampling.stride
-        if stride == 1 or min(image.shape[:2]) < stride * _MIN_SIDE_PX:
-            return View(camera, image.float() / 255)
-        cell = (visit * _COPRIME + index) % stride**2
-        left, top = cell % stride, cell // stride
-        return View(
-            _every_nth(camera, stride, left, top),
-            image[top::stride, left::stride].float() / 255,
-            low_pass_px2=_LOW_PASS_PX2 / stride**2,
-        )
-
-
-def _every_nth(camera: Cameras, stride: int, left: int, top: int) -> Cameras:
-    """The camera of every `stride`-th pixel, from the pixel `left`, `top` on."""
-    first = torch.tensor([left, top])
-    intrinsics = camera.intrinsics.clone()
-    intrinsics[:, :2] /= stride
-    # the centre of the first pixel, left + 0.5, becomes 0.5
-    intrinsics[:, :2, 2] += 0.5 - (first.to(intrinsics) + 0.5) / stride
-    return replace(camera, intrinsics=intrinsics, sizes=(camera.sizes - first + stride - 1) // stride)
+        view = View(level.cameras[index], level.images[index])
+        return view.every_nth(level.sampling.stride, visit=visit, index=index)
 
 
 def read_pyramid(capture: PosedImages, schedule: Sequence[Sampling], *, device: str, progress: Progress) -> Pyramid:
@@ -102,7 +66,7 @@ def read_pyramid(capture: PosedImages, schedule: Sequence[Sampling], *, device: 
         photograph = capture.image(i)
         camera = capture.cameras[i].to(device)
         for level, sampling in enumerate(schedule):
-            smallest = min(1.0, _MIN_SIDE_PX / min(camera.sizes[0].tolist()))
+            smallest = min(1.0, MIN_SIDE_PX / min(camera.sizes[0].tolist()))
             reduced = camera.resized(max(sampling.factor, smallest))
             width, height = reduced.sizes[0].tolist()
             cameras[level].append(reduced)

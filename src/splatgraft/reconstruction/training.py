@@ -15,8 +15,8 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.reconstruction.density import DensityControl
-from splatgraft.reconstruction.fit import FitState, LearningRates, Step, fit
+from splatgraft.fitting.density import DensityControl
+from splatgraft.fitting.gaussian_fit import FitOptions, FitState, LearningRates, Step, fit
 from splatgraft.reconstruction.image_pyramid import read_pyramid
 from splatgraft.reconstruction.initialization import (
     SeedPoints,
@@ -113,17 +113,9 @@ def reconstruct(
         wider = state.gaussians.with_sh_degree(degree)
         return replace(state, gaussians=wider, moments=state.moments.padded("sh", wider.sh.shape[1]))
 
-    rates = _rates(capture.cameras, options)
-    fitted = fit(
-        start,
-        views,
-        options=options,
-        rates=rates,
-        random_background=surroundings,
-        control=control,
-        progress=progress,
-        checkpoint=checkpoint,
-    )
+    background = None if surroundings else options.background
+    how = FitOptions(options.all_iterations, _rates(capture.cameras, options), background, options.seed)
+    fitted = fit(start, views, how, control=control, progress=progress, checkpoint=checkpoint)
     return fitted.with_sh_degree(options.sh_degree)
 
 

@@ -1,45 +1,53 @@
-"""Makes an extracted object opaque and finer: fits it alone to its masked photographs over random backgrounds.
+"""Makes an extracted object opaque and fine: fits it alone to its masked photographs over random backgrounds.
 
 In its own capture an object may be half transparent, or stick out of its outline, and still look right before what was
-fitted with it. Only an opaque object inside its mask matches the photographs over every background.
+fitted with it. Only an opaque object inside its mask matches the photographs over every background. All pixels and all
+Gaussians of this fit are the object's, so that the capture itself needs to be no more than a draft (docs/results.md).
 
-Where the object has fewer Gaussians than its size in the photographs asks for, those are split that have the largest
-gradient (3DGS, Sec. 5). What no photograph shows gets the colours of what is next to it. All constants are set by hand.
+Where the object has fewer Gaussians than its size in the photographs asks for, some are split, as in a reconstruction.
+What no photograph shows gets the colours of what is next to it. All constants are set by hand.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.core.splitting import PIECES, split_along
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.fitting.density import DensityControl
+from splatgraft.fitting.gaussian_fit import FitOptions, LearningRates, View, fit
 from splatgraft.rendering import RenderOptions, render, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
-_MAX_SHARE = 0.5
-"""Most Gaussians that it is split to, over those of the scene, whose number was chosen for the machine and time."""
-_DENSIFICATIONS = 8
-"""How many times Gaussians are split, evenly spaced."""
-_DENSIFIED = 0.6
-"""Share of the steps after which none is split."""
-_DEAD_OPACITY = 0.02
-"""Opacity below which a Gaussian is removed when others are split."""
+_DENSIFICATIONS = 20
+"""Intervals between which Gaussians are split."""
+_FULL_AT, _STOP_AT = 0.6, 0.7
+"""Shares of the steps after which the wanted number may be reached, and after which nothing is split or removed."""
+_ERROR_EVERY = 4
+"""Steps between two measurements of the error that each Gaussian covers."""
+_STRIDE = 2
+"""Every how many pixels along each axis a step fits."""
 _HIDDEN = 0.1
 """Pixels in which a Gaussian shows, over the square of its width, below which its colour is not known; over the median
 one."""
 _NEIGHBOURS = 8
 """Gaussians of known colour whose mean is taken then."""
-_OPACITY_RATE, _COLOR_RATE, _SCALE_RATE = 0.05, 0.0025, 0.005
-"""Learning rates of Adam: logits, band 0 (a twentieth for the others, as 3DGS), and natural logarithms per step."""
-_POSITION_RATE = 2e-4
-"""Learning rate of Adam, per step, over the object's radius."""
-_ROTATION_RATIO = 0.2
-"""Learning rate of the quaternions over that of the scales."""
+_RATES = LearningRates(
+    means=1.6e-3,
+    means_final=1.6e-5,
+    log_scales=0.04,
+    quaternions=0.008,
+    opacity_logits=0.1,
+    sh=0.02,
+    sh_higher=0.001,
+    view_colors=0.003,
+    final=0.1,
+)
+"""Learning rates; those of the centres over the object's radius."""
 _OCCLUDER_DISTANCE = 0.25
 """Distance in front of the object, over its extent, from which something else occludes it."""
 _MARGIN_PX = 12
@@ -50,22 +58,29 @@ _MARGIN_PX = 12
 class SolidifyOptions:
     """Length and detail of the fit."""
 
-    iterations: int = 800
+    iterations: int = 1600
     """Steps, one view each."""
-    pixels_per_gaussian: float = 6.0
+    pixels_per_gaussian: float = 3.0
     """Pixels of the object in the median view for each Gaussian that it should have; 0 splits none."""
+    budget: int = 50_000
+    """Most Gaussians that it is split to."""
+    photo_colors: bool = False
+    """Whether each photo has its own exposure and white balance, which then stay out of the object."""
     seed: int = 0
-    """Seed of the views and backgrounds drawn."""
+    """Seed of the order of views and of the backgrounds."""
 
 
 @dataclass(frozen=True)
-class _CroppedView:
-    """One view, cropped to the object."""
+class _ObjectViews:
+    """Views cropped to the object; a step sees every second pixel of one."""
 
-    camera: Cameras
-    image: Float[Tensor, "h w 3"]
-    mask: Float[Tensor, "h w 1"]
-    weight: Float[Tensor, "h w 1"]
+    views: Sequence[View]
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def at(self, index: int, *, visit: int, done: float) -> View:
+        return self.views[index].every_nth(_STRIDE, visit=visit, index=index)
 
 
 def solidify_object(
@@ -86,12 +101,15 @@ def solidify_object(
         selection: Which of them are the object's.
         cameras: v cameras, on the device of `scene`.
         photographs: The image (h, w, 3), sRGB in [0, 1], and the object mask (h, w) of each camera.
-        options: Steps and rates.
+        options: Steps, detail and seed.
         progress: Called with steps done, steps in all and a short text.
 
     Returns:
         The object's Gaussians, changed in every field, and more of them where the photographs show it larger than they
         are many.
+
+    Raises:
+        ValueError: No mask shows any of it.
     """
     chosen = scene.select(selection)
     views = [
@@ -101,90 +119,43 @@ def solidify_object(
     ]
     if not views:
         raise ValueError("object: expected a mask with some of it inside, found all empty")
-    wanted = 0
-    if options.pixels_per_gaussian > 0:
-        pixels = torch.tensor([float(view.mask.sum()) for view in views])
-        wanted = min(int(float(pixels.median()) / options.pixels_per_gaussian), int(_MAX_SHARE * scene.count))
-    first, stop = chosen.count, _DENSIFIED * options.iterations
-    every = max(1, int(stop / _DENSIFICATIONS))
-    fit = _Fit(chosen)
-    generator = torch.Generator().manual_seed(options.seed)
-    for step in range(options.iterations):
-        view = views[int(torch.randint(len(views), (1,), generator=generator))]
-        loss = fit.step(view, torch.rand(3, generator=generator))
-        if step % 20 == 0:
-            progress(step, options.iterations, f"making the object solid, loss {loss:.4f}")
-        if wanted > first and 0 < step <= stop and step % every == 0:
-            allowed = int(first + (wanted - first) * step / stop)
-            fit = _Fit(_with_splits(fit.gaussians, fit.scores, allowed))
-    progress(options.iterations, options.iterations, "the object is solid")
-    return _with_known_colors(fit.gaussians, views)
+    radius = float((chosen.means - chosen.means.mean(0)).norm(dim=1).quantile(0.9))
+    rates = replace(
+        _RATES,
+        means=radius * _RATES.means,
+        means_final=radius * _RATES.means_final,
+        view_colors=_RATES.view_colors if options.photo_colors else 0.0,
+    )
+    fitted = fit(
+        chosen,
+        _ObjectViews(views),
+        FitOptions(options.iterations, rates, background=None, seed=options.seed),
+        control=None if options.pixels_per_gaussian == 0 else _density(chosen, views, cameras, options).update,
+        progress=lambda done, total, text: progress(done, total, f"making the object solid, {text}"),
+    )
+    return _with_known_colors(fitted, views)
 
 
-class _Fit:
-    """Gaussians that are fitted, and their scores since the start."""
-
-    def __init__(self, gaussians: Gaussians) -> None:
-        radius = float((gaussians.means - gaussians.means.mean(0)).norm(dim=1).quantile(0.9))
-        rates = {
-            "means": _POSITION_RATE * radius,
-            "log_scales": _SCALE_RATE,
-            "quaternions": _ROTATION_RATIO * _SCALE_RATE,
-            "opacity_logits": _OPACITY_RATE,
-            "base": _COLOR_RATE,
-            "higher": _COLOR_RATE / 20,
-        }
-        start = vars(gaussians) | {"base": gaussians.sh[:, :1], "higher": gaussians.sh[:, 1:]}
-        self._leaves = {name: start[name].detach().clone().requires_grad_() for name in rates}
-        groups = [{"params": [self._leaves[name]], "lr": rate} for name, rate in rates.items()]
-        self._optimizer = torch.optim.Adam(groups, eps=1e-15)
-        self.scores = torch.zeros(gaussians.count, device=gaussians.device)
-        """Summed length of the loss gradient by the centre, over all pixels."""
-
-    def step(self, view: _CroppedView, background: Float[Tensor, "3"]) -> float:
-        """One step on one view over one background; gives the loss."""
-        options = RenderOptions(background=tuple(background.tolist()))
-        drawn = render(self._with_leaves(self._leaves), view.camera, options=options).color
-        target = view.mask * view.image + (1 - view.mask) * background.to(view.image)
-        loss = (view.weight * (drawn[0] - target).abs()).mean()
-        self._optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        if (gradient := self._leaves["means"].grad) is not None:
-            self.scores += gradient.norm(dim=1) * view.weight.numel()
-        self._optimizer.step()
-        return loss.item()
-
-    @property
-    def gaussians(self) -> Gaussians:
-        """The object as it is fitted so far."""
-        return self._with_leaves({name: leaf.detach() for name, leaf in self._leaves.items()})
-
-    @staticmethod
-    def _with_leaves(leaves: dict[str, Tensor]) -> Gaussians:
-        fields = {name: leaf for name, leaf in leaves.items() if name not in ("base", "higher")}
-        return Gaussians(sh=torch.cat([leaves["base"], leaves["higher"]], 1), **fields)
+def _density(chosen: Gaussians, views: Sequence[View], cameras: Cameras, options: SolidifyOptions) -> DensityControl:
+    """Splits up to as many Gaussians as the median view asks for."""
+    pixels = torch.tensor([float((view.mask > 127).sum()) for view in views if view.mask is not None])
+    wanted = min(int(float(pixels.median()) / options.pixels_per_gaussian), options.budget)
+    return DensityControl(
+        budget=max(wanted, chosen.count),
+        first_count=chosen.count,
+        every=max(1, options.iterations // _DENSIFICATIONS),
+        full_at=int(_FULL_AT * options.iterations),
+        stop=int(_STOP_AT * options.iterations),
+        camera_centers=cameras.centers,
+        error_every=_ERROR_EVERY,
+    )
 
 
-def _with_splits(gaussians: Gaussians, scores: Float[Tensor, "n"], allowed: int) -> Gaussians:
-    """At most `allowed` Gaussians: those with the highest scores split along their longest axis, transparent ones left
-    out."""
-    alive = gaussians.opacities > _DEAD_OPACITY
-    count = int(alive.sum())
-    parents = min((allowed - count) // (PIECES - 1), count)
-    if parents <= 0:
-        return gaussians
-    chosen = torch.zeros_like(alive)
-    chosen[torch.where(alive, scores, -1.0).topk(parents).indices] = True
-    split = gaussians.select(chosen)
-    pieces, _ = split_along(split, split.log_scales.argmax(1))
-    return concatenate([gaussians.select(alive & ~chosen), pieces])
-
-
-def _with_known_colors(gaussians: Gaussians, views: Sequence[_CroppedView]) -> Gaussians:
+def _with_known_colors(gaussians: Gaussians, views: Sequence[View]) -> Gaussians:
     """The Gaussians that hardly show in any view with the mean colour of the nearest that do, from all sides alike."""
     shown = torch.zeros(gaussians.count, device=gaussians.device)
     for view in views:
-        ones = torch.ones_like(view.mask)
+        ones = torch.ones_like(view.image[..., :1], dtype=torch.float32)
         shown += view_operator(gaussians, view.camera, RenderOptions()).blend_transpose(ones)[:, 0]
     widths = gaussians.scales.sort(1, descending=True).values[:, :2]
     known = shown / (widths.prod(1) * gaussians.opacities).clamp_min(1e-20)
@@ -206,7 +177,7 @@ def _cropped_view(
     camera: Cameras,
     image: Float[Tensor, "h w 3"],
     mask: Float[Tensor, "h w"],
-) -> _CroppedView | None:
+) -> View | None:
     """The view cropped to where the object shows; None where the mask is empty."""
     chosen = scene.select(selection)
     object_alone = render(chosen, camera, outputs=frozenset({"depth"}))
@@ -222,10 +193,14 @@ def _cropped_view(
     top, left = max(int(rows[0]) - _MARGIN_PX, 0), max(int(columns[0]) - _MARGIN_PX, 0)
     bottom = min(int(rows[-1]) + 1 + _MARGIN_PX, image.shape[0])
     right = min(int(columns[-1]) + 1 + _MARGIN_PX, image.shape[1])
-    device = scene.device
-    return _CroppedView(
+    window = slice(top, bottom), slice(left, right)
+
+    def cut(picture: Tensor) -> UInt8[Tensor, "h w c"]:
+        return (picture[window].clamp(0, 1) * 255).round().to(scene.device, torch.uint8)
+
+    return View(
         camera=camera.cropped([(left, top, right, bottom)]),
-        image=image[top:bottom, left:right].to(device),
-        mask=mask[top:bottom, left:right, None].to(device),
-        weight=(~hidden[top:bottom, left:right, None]).float(),
+        image=cut(image),
+        mask=cut(mask[..., None]),
+        is_compared=~hidden[window][..., None],
     )

@@ -10,7 +10,7 @@ from splatgraft.capture import VIDEO_FRAMES, predict_pose_seconds
 from splatgraft.commands.steps.capture import Capture
 from splatgraft.commands.steps.reconstruct import Reconstruct
 from splatgraft.commands.steps.render import Render
-from splatgraft.commands.steps.segment import Segment
+from splatgraft.commands.steps.segment import SOLID_SIDE_PX, Segment
 from splatgraft.core.cameras import Cameras, pinhole
 from splatgraft.core.images import stored_size
 from splatgraft.editor.jobs import PlannedStep
@@ -40,6 +40,9 @@ _TYPICAL_SECONDS = {
 Another project differs by a factor, which its finished steps give."""
 _SECONDS_PER_CUT = 1.2
 """Of each photo whose mask has to be cut."""
+_SECONDS_PER_OBJECT_PIXEL = 7e-8
+"""Of each step that fits the object, and each pixel of a photo; half for a small object, twice for one that
+fills it."""
 _SECONDS_PER_VIEW, _SECONDS_PER_MEGAPIXEL = 0.12, 0.2
 """Of each picture of the place that is rendered."""
 _FACTOR = 2.0
@@ -93,8 +96,12 @@ def _typical_seconds(step: Step, flow: Flow) -> float:
         if isinstance(step, Reconstruct) and not torch.cuda.is_available():
             seconds = predict_cpu_seconds(_views_of(step.capture, flow).cameras, step.options) / 2
             return _COMPILATION_SECONDS + seconds
-        if isinstance(step, Segment) and step.mask_source in ("auto", "grabcut") and step.masks is None:
-            return typical + _SECONDS_PER_CUT * _views_of(step.capture, flow).without_masks
+        if isinstance(step, Segment) and step.mask_source != "box":
+            views = _views_of(step.capture, flow)
+            is_cut = step.mask_source in ("auto", "grabcut") and step.masks is None
+            cut = _SECONDS_PER_CUT * views.without_masks if is_cut else 0.0
+            fitted = views.cameras.resized(min(1.0, SOLID_SIDE_PX / int(views.cameras.sizes.max())))
+            return typical + cut + step.solidify * _SECONDS_PER_OBJECT_PIXEL * fitted.width * fitted.height
         if isinstance(step, Render):
             cameras = _views_of(step.cameras, flow).cameras
             megapixels = cameras.width * cameras.height / 1e6

@@ -17,7 +17,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import resize, write_image
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.folders.capture_files import capture_inputs
+from splatgraft.folders.capture_files import capture_inputs, exposure_notes
 from splatgraft.folders.object_masks import (
     CUT_SIDE_PX,
     CutRequest,
@@ -61,7 +61,7 @@ from splatgraft.segmentation import (
 
 SHEET_FILE = "views.png"
 AGREEMENT_FILE = "agreement.json"
-_SOLID_SIDE_PX = 960
+SOLID_SIDE_PX = 960
 """Longest side at which the object is made solid: time and memory go with the area."""
 _PICTURED = 8
 """Photographs on the sheet."""
@@ -103,7 +103,7 @@ class Segment:
     corrections: Path | None = None
     """A .npy with one int8 per Gaussian of the scene, as the editor writes it: 1 adds it to the object, -1 removes."""
     solidify: int = SolidifyOptions.iterations
-    """Optimisation steps that make the object opaque when it is rendered alone; 0 keeps its Gaussians unchanged."""
+    """Steps that fit the object alone to its photographs, which makes it opaque and fine; 0 keeps its Gaussians."""
     keep_open: bool = False
     """Leave the side of the object open that no photograph shows; without it, it is closed."""
     device: Device = "auto"
@@ -152,7 +152,8 @@ class Segment:
         chosen = scene.select(selection)
         if self.solidify and masked is not None:
             views, photographs = _photographs(masked)
-            options, cameras = SolidifyOptions(iterations=self.solidify), views.cameras.to(device)
+            differ = bool(exposure_notes(self.capture, capture.image_paths))
+            options, cameras = SolidifyOptions(self.solidify, photo_colors=differ), views.cameras.to(device)
             chosen = solidify_object(scene, selection, cameras, photographs, options=options, progress=context.progress)
             context.console.say(f"object, made solid: {chosen.count:,} Gaussians")
         is_guessed = torch.zeros(chosen.count, dtype=torch.bool)
@@ -250,7 +251,7 @@ def _small_masks(masked: MaskedViews) -> tuple[Cameras, Sequence[Tensor]]:
 
 def _photographs(masked: MaskedViews) -> tuple[PosedImages, Sequence[tuple[Tensor, Tensor]]]:
     """The views at the size at which the object is made solid, and their images and masks, read when asked for."""
-    views = masked.views.limited(_SOLID_SIDE_PX)
+    views = masked.views.limited(SOLID_SIDE_PX)
     sizes = views.cameras.sizes.tolist()
     read = LazySequence(len(sizes), lambda index: (views.image(index), resize(masked.masks[index], *sizes[index])))
     return views, read

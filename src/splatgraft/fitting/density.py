@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.reconstruction.fit import FitState, Step
+from splatgraft.fitting.gaussian_fit import FitState, Step
 from splatgraft.rendering import view_operator
 
 # set by hand where no source is named

@@ -8,9 +8,7 @@ from memory_checkpoint import KilledError, MemoryCheckpoint
 
 from splatgraft.core import cameras as camera_values
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.reconstruction.fit import LearningRates, ViewColors, fit
-from splatgraft.reconstruction.image_pyramid import Level, Pyramid
-from splatgraft.reconstruction.options import ReconstructOptions, Sampling
+from splatgraft.fitting.gaussian_fit import FitOptions, LearningRates, View, ViewColors, fit
 from splatgraft.rendering import render
 
 
@@ -36,12 +34,19 @@ def ring(count: int, size: int = 32) -> camera_values.Cameras:
     return camera_values.pinhole(poses, 1.2 * size, width=size, height=size)
 
 
-def as_views(cameras: camera_values.Cameras, images: list[torch.Tensor]) -> Pyramid:
-    pictures = tuple((255 * image.clamp(0, 1)).round().to(torch.uint8) for image in images)
-    return Pyramid((Level(Sampling(1.0, 1, 1.0), tuple(cameras), pictures),))
+class Photographs(list[View]):
+    """Views that every step sees whole."""
+
+    def at(self, index: int, *, visit: int, done: float) -> View:
+        return self[index]
 
 
-def views_of(scene: Gaussians, gains: tuple[float, ...] = (1.0,) * 6) -> Pyramid:
+def as_views(cameras: camera_values.Cameras, images: list[torch.Tensor]) -> Photographs:
+    pictures = [(255 * image.clamp(0, 1)).round().to(torch.uint8) for image in images]
+    return Photographs(View(camera, image) for camera, image in zip(cameras, pictures, strict=True))
+
+
+def views_of(scene: Gaussians, gains: tuple[float, ...] = (1.0,) * 6) -> Photographs:
     cameras = ring(len(gains))
     with torch.no_grad():
         return as_views(cameras, [g * image for g, image in zip(gains, render(scene, cameras).color, strict=True)])
@@ -51,7 +56,7 @@ def test_colours_alone_are_recovered_and_all_else_stays():
     truth = blobs(60, 4)
     start = replace(truth, sh=torch.zeros_like(truth.sh))
     rates = LearningRates(sh=0.05, sh_higher=0.05)
-    fitted = fit(start, views_of(truth), options=ReconstructOptions(iterations=120), rates=rates)
+    fitted = fit(start, views_of(truth), FitOptions(120, rates))
     assert torch.equal(fitted.means, truth.means)
     assert torch.equal(fitted.opacity_logits, truth.opacity_logits)
     before, after = (
@@ -65,18 +70,18 @@ def test_colours_alone_are_recovered_and_all_else_stays():
 def test_every_field_that_has_a_rate_moves():
     truth = blobs(60, 5)
     rates = LearningRates(means=1e-3, log_scales=1e-3, quaternions=1e-3, opacity_logits=1e-3, sh=1e-3)
-    fitted = fit(truth, views_of(blobs(60, 6)), options=ReconstructOptions(iterations=6), rates=rates)
+    fitted = fit(truth, views_of(blobs(60, 6)), FitOptions(6, rates))
     for name in rates.active():
         assert not torch.equal(getattr(fitted, name), getattr(truth, name)), name
     assert torch.equal(fitted.sh[:, 1:], truth.sh[:, 1:])
 
 
 def test_a_killed_fit_resumes_bit_for_bit(monkeypatch):
-    monkeypatch.setattr("splatgraft.reconstruction.fit._CHECKPOINT_SECONDS", -1.0)
+    monkeypatch.setattr("splatgraft.fitting.gaussian_fit._CHECKPOINT_SECONDS", -1.0)
     views, start = views_of(blobs(60, 7)), blobs(60, 8)
     rates = LearningRates(means=1e-2, means_final=1e-4, log_scales=1e-2, quaternions=1e-2, opacity_logits=1e-2, sh=1e-2)
-    options = ReconstructOptions(iterations=40, seed=3)
-    whole = fit(start, views, options=options, rates=rates)
+    options = FitOptions(40, rates, seed=3)
+    whole = fit(start, views, options)
     checkpoint = MemoryCheckpoint()
 
     def die(done: int, total: int, message: str) -> None:
@@ -84,10 +89,10 @@ def test_a_killed_fit_resumes_bit_for_bit(monkeypatch):
             raise KilledError
 
     with pytest.raises(KilledError):
-        fit(start, views, options=options, rates=rates, progress=die, checkpoint=checkpoint)
+        fit(start, views, options, progress=die, checkpoint=checkpoint)
     assert checkpoint.state is not None
     assert 0 < checkpoint.state["iteration"] < 40
-    resumed = fit(start, views, options=options, rates=rates, checkpoint=checkpoint)
+    resumed = fit(start, views, options, checkpoint=checkpoint)
     for name in rates.active():
         assert torch.equal(getattr(whole, name), getattr(resumed, name)), name
 
@@ -99,7 +104,7 @@ def test_colours_that_differ_between_views_do_not_enter_the_scene():
     errors = []
     for rate in (0.0, 0.01):
         rates = LearningRates(sh=0.02, view_colors=rate)
-        fitted = fit(grey, tinted, options=ReconstructOptions(iterations=240), rates=rates)
+        fitted = fit(grey, tinted, FitOptions(240, rates))
         errors.append(float((fitted.sh - truth.sh).abs().median()))
     # the gains' mean is 1, so the scene's colours are those before the gains
     assert errors[1] < 0.7 * errors[0]
@@ -110,11 +115,39 @@ def test_a_random_background_leaves_no_holes_before_what_is_dark():
     views = as_views(cameras, [torch.zeros(32, 32, 3)] * 6)
     alphas = []
     for random in (False, True):
-        options, rates = ReconstructOptions(iterations=60), LearningRates(opacity_logits=0.05)
-        fitted = fit(dark, views, options=options, rates=rates, random_background=random)
+        background = None if random else (0.0, 0.0, 0.0)
+        fitted = fit(dark, views, FitOptions(60, LearningRates(opacity_logits=0.05), background))
         alphas.append(float(render(fitted, cameras).alpha.mean()))
     # what comes through from a random background, half bright in the mean, is an error of as much
     assert alphas[1] > 1.1 * alphas[0]
+
+
+def test_what_a_mask_leaves_out_shows_the_background_and_what_is_hidden_counts_for_nothing():
+    truth, cameras = blobs(60, 4), ring(6)
+    drawn = render(truth, cameras)
+    whole = as_views(cameras, list(drawn.color))
+    masks = [(255 * alpha[..., None]).round().to(torch.uint8) for alpha in drawn.alpha]
+    left = torch.arange(32)[None, :, None].expand(32, 32, 1) < 16
+
+    def error(views: Photographs) -> tuple[float, float]:
+        """Of the opacity after a fit from a thinner scene, in the left and in the right half."""
+        thin = replace(truth, opacity_logits=truth.opacity_logits - 2)
+        fitted = fit(thin, views, FitOptions(90, LearningRates(opacity_logits=0.1), background=None))
+        missed = (render(fitted, cameras).alpha - drawn.alpha)[..., None].abs()
+        return float(missed[:, left].mean()), float(missed[:, ~left].mean())
+
+    # without masks, the black around the object is taken for what is fitted
+    seen = [replace(view, mask=mask, image=_over_nothing(view, mask)) for view, mask in zip(whole, masks, strict=True)]
+    assert sum(error(Photographs(seen))) < 0.5 * sum(error(whole))
+    # something hides the right half, so that it is not in the masks
+    hidden = [replace(view, mask=view.mask * left) for view in seen]
+    ignored = Photographs(replace(view, is_compared=left) for view in hidden)
+    assert error(ignored)[1] < 0.5 * error(Photographs(hidden))[1]
+
+
+def _over_nothing(view: View, mask: torch.Tensor) -> torch.Tensor:
+    """The colours of a picture over black before they were multiplied by its mask."""
+    return (view.image.float() / mask.float().clamp_min(1) * 255).clamp(0, 255).round().to(torch.uint8)
 
 
 def test_the_mean_of_the_views_colours_stays_the_identity():
@@ -130,7 +163,7 @@ def test_the_mean_of_the_views_colours_stays_the_identity():
 def test_what_is_not_finite_is_an_error_that_says_so():
     broken = replace(blobs(20, 9), sh=torch.full((20, 4, 3), float("nan")))
     with pytest.raises(ValueError, match="found a loss of nan at step 0"):
-        fit(broken, views_of(blobs(20, 9)), options=ReconstructOptions(iterations=3), rates=LearningRates(sh=0.1))
+        fit(broken, views_of(blobs(20, 9)), FitOptions(3, LearningRates(sh=0.1)))
 
 
 def test_rates_fall_as_3dgs_says():

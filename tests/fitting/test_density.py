@@ -6,8 +6,8 @@ from shapes import random_scene
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting.adam import no_moments
-from splatgraft.reconstruction.density import DensityControl, split
-from splatgraft.reconstruction.fit import FitState, Step, ViewColors
+from splatgraft.fitting.density import DensityControl, split
+from splatgraft.fitting.gaussian_fit import FitState, Step, ViewColors
 from splatgraft.rendering import RenderOptions
 
 

@@ -8,17 +8,16 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.fitting import adam, l1_dssim
-from splatgraft.reconstruction.image_pyramid import Pyramid
-from splatgraft.reconstruction.options import ReconstructOptions
+from splatgraft.fitting import adam
+from splatgraft.fitting.photometric import l1_dssim
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.process import interruption_held
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
@@ -26,6 +25,68 @@ from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, sile
 _REPORT_EVERY = 10
 """Steps."""
 _CHECKPOINT_SECONDS = 30.0
+_COPRIME = 3
+"""Step through the cells of a stride: visits go through all of them, for strides of 2 and 4."""
+MIN_SIDE_PX = 32
+"""Smallest side of an image that is fitted: below it the 11-pixel window of SSIM covers most of the image."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera and its target image."""
+
+    camera: Cameras
+    """A batch of one."""
+    image: UInt8[Tensor, "h w 3"]
+    """sRGB times 255."""
+    mask: UInt8[Tensor, "h w 1"] | None = None
+    """Share of each pixel that shows what is fitted, times 255; the rest shows the background. None: all of it."""
+    is_compared: Bool[Tensor, "h w 1"] | None = None
+    """Which pixels count; None: all."""
+    low_pass_px2: float = RenderOptions.low_pass_px2
+    """Low pass of the rendering, pixels squared."""
+
+    def every_nth(self, stride: int, *, visit: int, index: int) -> "View":
+        """Every `stride`-th pixel along both axes, without averaging, so that the gradient is that of all pixels up to
+        chance; the first is another one for every visit of a view and every index of it. A small view stays whole."""
+        if stride == 1 or min(self.image.shape[:2]) < stride * MIN_SIDE_PX:
+            return self
+        cell = (visit * _COPRIME + index) % stride**2
+        left, top = cell % stride, cell // stride
+        first = torch.tensor([left, top])
+        intrinsics = self.camera.intrinsics.clone()
+        intrinsics[:, :2] /= stride
+        # the centre of the first pixel, left + 0.5, becomes 0.5
+        intrinsics[:, :2, 2] += 0.5 - (first.to(intrinsics) + 0.5) / stride
+        sizes = (self.camera.sizes - first + stride - 1) // stride
+        return View(
+            replace(self.camera, intrinsics=intrinsics, sizes=sizes),
+            self.image[top::stride, left::stride],
+            None if self.mask is None else self.mask[top::stride, left::stride],
+            None if self.is_compared is None else self.is_compared[top::stride, left::stride],
+            # that of the photograph stays
+            self.low_pass_px2 / stride**2,
+        )
+
+    def target(self, background: Float[Tensor, "3"], drawn: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        """What a picture `drawn` over `background` should be; where nothing is compared, itself."""
+        target = self.image.float() / 255
+        if self.mask is not None:
+            share = self.mask.float() / 255
+            target = share * target + (1 - share) * background
+        return target if self.is_compared is None else torch.where(self.is_compared, target, drawn.detach())
+
+
+class Views(Protocol):
+    """What is fitted: v photographs."""
+
+    def __len__(self) -> int:
+        """Number of photographs, v."""
+        ...
+
+    def at(self, index: int, *, visit: int, done: float) -> View:
+        """View `index` when it is seen for the time `visit` (from 0), after the share `done` in [0, 1] of all steps."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -68,6 +129,20 @@ class LearningRates:
         if field == "sh":
             rates[3:] = self.sh_higher * left
         return rates
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Length, rates, background and seed of a fit."""
+
+    iterations: int
+    """Steps, one view each."""
+    rates: LearningRates
+    """Of every field."""
+    background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
+    """sRGB behind the scene; None: another one at every step, so that what is dark has no holes."""
+    seed: int = 0
+    """Of the order of views and of the backgrounds."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +217,7 @@ class Step:
     gradients: dict[str, Tensor]
     """Gradients of the loss, by field."""
     residual: Float[Tensor, "h w 3"]
-    """The rendered image minus the photograph, sRGB."""
+    """The rendered image minus what it should be, sRGB."""
     rendering: RenderOptions
     """With which it was rendered."""
 
@@ -151,13 +226,11 @@ Control = Callable[[FitState, Step], FitState]
 """Called after every step; may add, change and remove Gaussians, and store tensors in `memory`."""
 
 
-def fit(  # noqa: PLR0913 - with progress and checkpoint
+def fit(
     gaussians: Gaussians,
-    views: Pyramid,
+    views: Views,
+    options: FitOptions,
     *,
-    options: ReconstructOptions,
-    rates: LearningRates,
-    random_background: bool = False,
     control: Control | None = None,
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
@@ -167,19 +240,19 @@ def fit(  # noqa: PLR0913 - with progress and checkpoint
     The state is saved every 30 seconds and on Ctrl-C, and a run goes on from it. A ValueError where loss or gradients
     are not finite.
     """
-    names = rates.active()
+    names = options.rates.active()
     saved = checkpoint.load()
     state = _start(gaussians, names, len(views)) if saved is None else _unpacked(saved, gaussians.device)
     last_save, recent = time.monotonic(), 0.0
     with interruption_held() as interrupted:
-        while state.iteration < options.all_iterations:
-            state, value, step = _stepped(state, views, rates, options, random_background)
+        while state.iteration < options.iterations:
+            state, value, step = _stepped(state, views, options)
             if control is not None:
                 state = control(state, step)
             recent = value if recent == 0 else 0.95 * recent + 0.05 * value
-            if state.iteration % _REPORT_EVERY == 0 or state.iteration == options.all_iterations:
+            if state.iteration % _REPORT_EVERY == 0 or state.iteration == options.iterations:
                 message = f"loss {recent:.4f}, {state.gaussians.count / 1000:.1f}k Gaussians"
-                progress(state.iteration, options.all_iterations, message)
+                progress(state.iteration, options.iterations, message)
             due = interrupted() or time.monotonic() - last_save > _CHECKPOINT_SECONDS
             if due and not isinstance(checkpoint, NoCheckpoint):
                 checkpoint.save(_packed(state))
@@ -189,28 +262,24 @@ def fit(  # noqa: PLR0913 - with progress and checkpoint
     return state.gaussians
 
 
-def _stepped(
-    state: FitState, views: Pyramid, rates: LearningRates, options: ReconstructOptions, random_background: bool
-) -> tuple[FitState, float, Step]:
+def _stepped(state: FitState, views: Views, options: FitOptions) -> tuple[FitState, float, Step]:
     """The state after one step on one view, the loss, and what the control sees."""
-    names, done = rates.active(), state.iteration / options.all_iterations
+    rates, done = options.rates, state.iteration / options.iterations
+    names = rates.active()
     visit, place = divmod(state.iteration, len(views))
     # each pass visits all views in an order that depends on seed and pass only
     index = int(torch.randperm(len(views), generator=_generator(options.seed, visit))[place])
     view = views.at(index, visit=visit, done=done)
-    rendering = RenderOptions(background=options.background)
-    if view.low_pass_px2 is not None:
-        rendering = replace(rendering, low_pass_px2=view.low_pass_px2)
-    if random_background:
-        # uniform in sRGB; depends on seed and iteration only
-        red, green, blue = torch.rand(3, generator=_generator(options.seed, state.iteration, plus=1)).tolist()
-        rendering = replace(rendering, background=(red, green, blue))
+    rendering = RenderOptions(background=_background(options, state.iteration), low_pass_px2=view.low_pass_px2)
     leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
     drawn = render(replace(state.gaussians, **leaves), view.camera, options=rendering)
     fits_colors = rates.view_colors > 0
     colors = state.view_colors.of(index).requires_grad_(fits_colors)
-    picture = drawn.color[0] @ colors[:, :3].T + colors[:, 3] if fits_colors else drawn.color[0]
-    loss = l1_dssim(picture, view.image)
+    picture, background = drawn.color[0], torch.tensor(rendering.background, device=colors.device)
+    if fits_colors:
+        picture, background = (x @ colors[:, :3].T + colors[:, 3] for x in (picture, background))
+    target = view.target(background, picture)
+    loss = l1_dssim(picture, target)
     value = float(loss.detach())
     if not math.isfinite(value):
         raise _diverged(state, f"a loss of {value}")
@@ -223,7 +292,7 @@ def _stepped(
     of_fields = {name: rates.at(name, done, v[0].numel() if len(v) else 1) for name, v in values.items()}
     if not adam.step(values, gradients, moments=state.moments, rates=of_fields, visible=drawn.visible[0]):
         raise _diverged(state, "a gradient that is not finite")
-    step = Step(view.camera, drawn.visible[0], gradients, picture.detach() - view.image, rendering)
+    step = Step(view.camera, drawn.visible[0], gradients, (picture - target).detach(), rendering)
     return replace(state, iteration=state.iteration + 1), value, step
 
 
@@ -232,6 +301,14 @@ def _diverged(state: FitState, found: str) -> ValueError:
         f"fit: expected finite numbers, found {found} at step {state.iteration} (the last checkpoint stands); "
         "lower the learning rates or look for broken images and cameras"
     )
+
+
+def _background(options: FitOptions, iteration: int) -> tuple[float, float, float]:
+    if options.background is not None:
+        return options.background
+    # uniform in sRGB; depends on seed and iteration only
+    red, green, blue = torch.rand(3, generator=_generator(options.seed, iteration, plus=1)).tolist()
+    return red, green, blue
 
 
 def _generator(seed: int, number: int, plus: int = 0) -> torch.Generator:
