@@ -10,6 +10,10 @@ psnr, ssim and flip compare with the views as photographed; psnr_fit after the c
 photo by a least-squares affine map, which leaves exposure and white balance out. CPU seconds count all threads of the
 reconstruction; structure from motion is not part of either time.
 
+With `--object` the object is cut by the masks of the photos that were not held out (the capture's own, or `--masks
+FOLDER` by their names), fitted alone as `segment` does, and compared inside the masks of those held out, before (`cut`)
+and after: two more lines, of which the seconds are those of cutting and fitting alone.
+
 Every quality fits photos of its own size, and is compared at that size unless `--longest-px` gives others, one line for
 each: small pictures are easier to match, so that figures of two qualities can be compared at one size only.
 """
@@ -23,16 +27,23 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as cli.py does; read when torch and numba load
 
+import torch
+
+from splatgraft.commands.steps.segment import SOLID_SIDE_PX
+from splatgraft.core.exposure import describe_inconsistency, relative_gains
 from splatgraft.core.flip import flip
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import fit_color, psnr, ssim
 from splatgraft.core.images import list_images
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.folders.capture_files import has_poses
+from splatgraft.folders.object_masks import with_mask_folder
 from splatgraft.formats import read_capture
+from splatgraft.formats.captures.exif import read_exposure
 from splatgraft.reconstruction import ReconstructOptions, reconstruct
-from splatgraft.rendering import render
+from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
+from splatgraft.segmentation import SolidifyOptions, segment
 
 EVERY = 8
 FEWEST_PHOTOS = 3
@@ -63,19 +74,39 @@ def posed(capture: Path, work: Path) -> Path:
     return out
 
 
-def measure(name: str, folder: Path, quality: str, device: str, longest_px: list[int]) -> None:
+def measure(name: str, args: argparse.Namespace) -> None:
     """Reconstruct and print a line for each size; without sizes, for the size at which the photos were fitted."""
-    capture = read_capture(folder)
-    options = ReconstructOptions(quality=quality, eval_every=EVERY, device=device)  # pyright: ignore[reportArgumentType]
+    capture, line = read_capture(args.folder), f"capture={name} quality={args.quality[0]} device={args.device}"
+    options = ReconstructOptions(quality=args.quality[0], eval_every=EVERY, device=args.device)
     reset_peak_memory()
     begin, begin_cpu = time.perf_counter(), time.process_time()
     scene = reconstruct(capture, options).to("cpu")
-    seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
-    peak = peak_memory_bytes() / 2**20
-    cost = f"seconds={seconds:.0f} cpu_seconds={cpu:.0f} gaussians={scene.count} peak_mb={peak:.0f}"
-    sizes = [capture.limited(size) for size in longest_px] or [options.served(capture)]
+    cost = f"{cost_since(begin, begin_cpu, scene)} peak_mb={peak_memory_bytes() / 2**20:.0f}"
+    sizes = [capture.limited(size) for size in args.longest_px] or [options.served(capture)]
     for photos in (size.select(held_out(len(size), EVERY)) for size in sizes):
-        print(f"capture={name} quality={quality} device={device} {compare(scene, photos)} {cost}", flush=True)
+        print(f"{line} {compare(scene, photos)} {cost}", flush=True)
+    if not args.object:
+        return
+    photos = with_mask_folder(capture, args.masks, args.folder).limited(SOLID_SIDE_PX)
+    testing = torch.tensor([n in held_out_names(capture) for n in photos.cameras.names])
+    exposures = [read_exposure(path) for path in photos.select(~testing).image_paths]
+    gains = None if describe_inconsistency(exposures) is None else relative_gains(exposures)
+    for what, solidify in (("cut", None), ("object", SolidifyOptions(view_gains=gains))):
+        begin, begin_cpu = time.perf_counter(), time.process_time()
+        found = segment(scene, photos.select(~testing), solidify=solidify).object
+        cost = cost_since(begin, begin_cpu, found)
+        print(f"{line} {what} {compare_object(found, photos.select(testing))} {cost}", flush=True)
+
+
+def cost_since(begin: float, begin_cpu: float, made: Gaussians) -> str:
+    """The part of the line that says what something took."""
+    seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
+    return f"seconds={seconds:.0f} cpu_seconds={cpu:.0f} gaussians={made.count}"
+
+
+def held_out_names(capture: PosedImages) -> set[str]:
+    """Names of the photos that were not fitted."""
+    return set(capture.select(held_out(len(capture), EVERY)).cameras.names)
 
 
 def compare(scene: Gaussians, photos: PosedImages) -> str:
@@ -94,17 +125,35 @@ def compare(scene: Gaussians, photos: PosedImages) -> str:
     )
 
 
+def compare_object(found: Gaussians, photos: PosedImages) -> str:
+    """The part of the line that says how close the object comes to the photos inside its masks, over grey."""
+    rows: list[tuple[float, ...]] = []
+    for i in range(len(photos)):
+        mask = photos.mask(i)
+        if mask is None or not bool((mask > 0.5).any()):
+            continue
+        drawn = render(found, photos.cameras[i], options=RenderOptions(background=(0.5, 0.5, 0.5)))
+        picture, truth = (image[mask > 0.5][None] for image in (drawn.color[0].clamp(0, 1), photos.image(i)))
+        overlap = torch.minimum(drawn.alpha[0], mask).sum() / torch.maximum(drawn.alpha[0], mask).sum()
+        found_here = (psnr(picture, truth), psnr(fit_color(picture, truth), truth), overlap)
+        rows.append(tuple(float(value) for value in found_here))
+    decibel, of_fitted, overlap = (sum(column) / len(rows) for column in zip(*rows, strict=True))
+    return f"views={len(rows)} psnr={decibel:.2f} psnr_fit={of_fitted:.2f} overlap={overlap:.3f}"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--quality", nargs="+", default=["draft", "standard"])
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--longest-px", nargs="*", type=int, default=[], help="compare at these sizes")
+    parser.add_argument("--object", action="store_true", help="compare the object, cut by its masks, as well")
+    parser.add_argument("--masks", type=Path, help="masks of the object, where the capture has none")
     parser.add_argument("--work", type=Path, default=Path("captures"), help="where posed captures are kept")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one:
-        measure(args.one, args.folder, args.quality[0], args.device, args.longest_px)
+        measure(args.one, args)
         return 0
     failed = 0
     for capture in find_captures(args.folder):
@@ -116,8 +165,9 @@ def main() -> int:
             continue
         for quality in args.quality:
             words = ["--quality", quality, "--device", args.device, "--one", name_of(capture)]
-            sizes = ["--longest-px", *map(str, args.longest_px)]
-            command = [sys.executable, __file__, str(folder), *words, *sizes]
+            words += ["--longest-px", *map(str, args.longest_px), *(["--object"] if args.object else [])]
+            words += ["--masks", str(args.masks)] if args.masks else []
+            command = [sys.executable, __file__, str(folder), *words]
             failed += subprocess.run(command, check=False).returncode != 0
     return 1 if failed else 0
 

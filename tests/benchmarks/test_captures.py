@@ -21,6 +21,9 @@ def folder(tmp_path) -> Path:
     paths = tuple(tmp_path / f"{i}.png" for i in range(len(made.images)))
     for path, image in zip(paths, made.images, strict=True):
         write_image(path, image)
+    (tmp_path / "masks").mkdir()
+    for i, mask in enumerate(made.masks):
+        write_image(tmp_path / "masks" / f"{i}.png", mask.float())
     points = made.scene.means[::4]
     photos = PosedImages(
         image_paths=paths, cameras=made.cameras, points=points, point_colors=torch.full((len(points), 3), 0.5)
@@ -33,14 +36,29 @@ def folder(tmp_path) -> Path:
 @pytest.mark.long
 def test_one_reconstruction_is_compared_at_every_size_that_is_asked_for(folder):
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    words = [str(folder), "--quality", "draft", "--longest-px", "48", "96"]
+    words = [
+        str(folder),
+        "--quality",
+        "draft",
+        "--longest-px",
+        "48",
+        "96",
+        "--object",
+        "--masks",
+        str(folder.parent / "masks"),
+    ]
     done = subprocess.run(
         [sys.executable, captures.__file__, *words], capture_output=True, text=True, check=True, env=environment
     )
-    small, large = (dict(word.split("=") for word in line.split()) for line in done.stdout.splitlines())
+    small, large, cut, fitted = (
+        dict(word.split("=") for word in line.split() if "=" in word) for line in done.stdout.splitlines()
+    )
     assert (small["longest_px"], large["longest_px"]) == ("48", "96")
     assert (small["capture"], small["quality"], small["views"]) == ("toy", "draft", "2")
     # one reconstruction: its cost is the same to the second
     assert all(small[name] == large[name] for name in ("seconds", "cpu_seconds", "gaussians", "peak_mb"))
     assert small["psnr"] != large["psnr"]
     assert float(large["psnr"]) > 20
+    # fitted alone, it sticks out of its outline less
+    assert float(fitted["overlap"]) > float(cut["overlap"])
+    assert float(fitted["psnr_fit"]) > 25

@@ -43,9 +43,7 @@ def split_parents(error_every: int) -> list[float]:
     gradients = {"means": torch.tensor([[1.1, 0, 0], [1, 0, 0], [1, 0, 0]])}
     seen = torch.ones(3, dtype=torch.bool)
     step = Step(camera, seen, gradients, residual, RenderOptions())
-    state = FitState(
-        10, gaussians, no_moments({"means": gaussians.means}, 3), ViewColors.identity(1, torch.device("cpu"))
-    )
+    state = FitState(10, gaussians, no_moments({"means": gaussians.means}, 3), ViewColors.start(torch.ones(1)))
     control = DensityControl(4, 3, 10, 10, 20, camera.centers, error_every=error_every)
     return control.update(state, step).gaussians.means[:2, 0].tolist()
 

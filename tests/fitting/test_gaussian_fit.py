@@ -151,7 +151,7 @@ def _over_nothing(view: View, mask: torch.Tensor) -> torch.Tensor:
 
 
 def test_the_mean_of_the_views_colours_stays_the_identity():
-    colors = ViewColors.identity(5, torch.device("cpu"))
+    colors = ViewColors.start(torch.ones(5))
     generator = torch.Generator().manual_seed(0)
     for step in range(40):
         colors = colors.updated(step % 3, torch.randn(3, 4, generator=generator), 0.01)

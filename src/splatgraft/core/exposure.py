@@ -13,6 +13,7 @@ _SATURATION_CD_M2 = 78 / (100 * 0.65)
 """Luminance of white at EV 0 and ISO 100."""
 _EV_OF_BRIGHTNESS_0 = 5.0
 """APEX: the speed value of ISO 100."""
+_GAMMA = 2.2
 MAX_STOPS = 0.4
 """Between the darkest and the brightest setting of a capture's photos, above which settings count as different: a third
 of a stop, one step of a camera's dial, which with the rounded numbers on it is up to 0.36 (1/160 s and 1/125 s)."""
@@ -54,6 +55,17 @@ class Exposure:
         short = self.shutter_s < 0.4
         shutter = f"1/{1 / self.shutter_s:.0f}" if short else f"{self.shutter_s:.2g}"
         return f"{shutter} s f/{self.aperture:.2g} ISO {self.iso:.0f}"
+
+
+def relative_gains(exposures: Sequence[Exposure]) -> list[float]:
+    """How much brighter each photo's sRGB values are than the mean photo's, by its settings; 1 where they are unknown.
+
+    A factor on linear light is its 2.2th root in sRGB, before a camera's tone curve.
+    """
+    stops = [one.ev100 for one in exposures if one.ev100 is not None]
+    middle = sum(stops) / max(len(stops), 1)
+    gains = [1.0 if one.ev100 is None else 2 ** ((middle - one.ev100) / _GAMMA) for one in exposures]
+    return [gain * len(gains) / sum(gains) for gain in gains]
 
 
 @dataclass(frozen=True)

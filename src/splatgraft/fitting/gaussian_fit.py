@@ -6,7 +6,7 @@ same bits as an uninterrupted one.
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Protocol
 
@@ -141,6 +141,8 @@ class FitOptions:
     """Of every field."""
     background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
     """sRGB behind the scene; None: another one at every step, so that what is dark has no holes."""
+    view_gains: Sequence[float] | None = None
+    """Brightness of each view over their mean, from which the views' colours start; None: the same for all."""
     seed: int = 0
     """Of the order of views and of the backgrounds."""
 
@@ -164,10 +166,11 @@ class ViewColors:
     """Updates of each view."""
 
     @staticmethod
-    def identity(views: int, device: torch.device) -> "ViewColors":
-        """No view differs from the scene."""
-        zeros = torch.zeros(views, 3, 4, device=device)
-        return ViewColors(zeros, zeros, zeros, torch.zeros(views, dtype=torch.int32, device=device))
+    def start(gains: Float[Tensor, "v"]) -> "ViewColors":
+        """The scene times a factor of each view, 1 in the mean."""
+        maps = (gains - gains.mean())[:, None, None] * torch.eye(3, 4, device=gains.device)
+        zeros = torch.zeros_like(maps)
+        return ViewColors(maps, zeros, zeros, torch.zeros(len(gains), dtype=torch.int32, device=gains.device))
 
     def of(self, view: int) -> Float[Tensor, "3 4"]:
         """Matrix and offset from the scene's colours to the view's."""
@@ -242,7 +245,8 @@ def fit(
     """
     names = options.rates.active()
     saved = checkpoint.load()
-    state = _start(gaussians, names, len(views)) if saved is None else _unpacked(saved, gaussians.device)
+    gains = torch.tensor([1.0] * len(views) if options.view_gains is None else list(options.view_gains))
+    state = _start(gaussians, names, gains) if saved is None else _unpacked(saved, gaussians.device)
     last_save, recent = time.monotonic(), 0.0
     with interruption_held() as interrupted:
         while state.iteration < options.iterations:
@@ -315,10 +319,10 @@ def _generator(seed: int, number: int, plus: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed((seed * 1_000_003 + number) % 2**62 + plus)
 
 
-def _start(gaussians: Gaussians, names: tuple[str, ...], views: int) -> FitState:
+def _start(gaussians: Gaussians, names: tuple[str, ...], gains: Float[Tensor, "v"]) -> FitState:
     own = gaussians.map(lambda tensor: tensor.detach().clone().contiguous())
     moments = adam.no_moments({name: getattr(own, name) for name in names}, own.count)
-    return FitState(0, own, moments, ViewColors.identity(views, own.device))
+    return FitState(0, own, moments, ViewColors.start(gains.to(own.device)))
 
 
 def _packed(state: FitState) -> dict[str, Any]:

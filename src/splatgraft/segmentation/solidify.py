@@ -64,8 +64,9 @@ class SolidifyOptions:
     """Pixels of the object in the median view for each Gaussian that it should have; 0 splits none."""
     budget: int = 50_000
     """Most Gaussians that it is split to."""
-    photo_colors: bool = False
-    """Whether each photo has its own exposure and white balance, which then stay out of the object."""
+    view_gains: Sequence[float] | None = None
+    """Brightness of each photo over their mean, where exposure and white balance differ: they are fitted, and stay out
+    of the object."""
     seed: int = 0
     """Seed of the order of views and of the backgrounds."""
 
@@ -112,11 +113,11 @@ def solidify_object(
         ValueError: No mask shows any of it.
     """
     chosen = scene.select(selection)
-    views = [
-        view
-        for camera, (image, mask) in zip(cameras, photographs, strict=True)
-        if (view := _cropped_view(scene, selection, camera, image, mask)) is not None
-    ]
+    views, gains = [], []
+    for index, (camera, (image, mask)) in enumerate(zip(cameras, photographs, strict=True)):
+        if (view := _cropped_view(scene, selection, camera, image, mask)) is not None:
+            views.append(view)
+            gains.append(1.0 if options.view_gains is None else options.view_gains[index])
     if not views:
         raise ValueError("object: expected a mask with some of it inside, found all empty")
     radius = float((chosen.means - chosen.means.mean(0)).norm(dim=1).quantile(0.9))
@@ -124,12 +125,12 @@ def solidify_object(
         _RATES,
         means=radius * _RATES.means,
         means_final=radius * _RATES.means_final,
-        view_colors=_RATES.view_colors if options.photo_colors else 0.0,
+        view_colors=0.0 if options.view_gains is None else _RATES.view_colors,
     )
     fitted = fit(
         chosen,
         _ObjectViews(views),
-        FitOptions(options.iterations, rates, background=None, seed=options.seed),
+        FitOptions(options.iterations, rates, background=None, view_gains=gains, seed=options.seed),
         control=None if options.pixels_per_gaussian == 0 else _density(chosen, views, cameras, options).update,
         progress=lambda done, total, text: progress(done, total, f"making the object solid, {text}"),
     )
