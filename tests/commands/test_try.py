@@ -12,8 +12,10 @@ from tiny_project import ball, photograph, plane
 from splatgraft.cli import main
 from splatgraft.commands import first_try
 from splatgraft.commands.first_try import refinements
+from splatgraft.commands.steps import segment
 from splatgraft.project.record import Record, read_record, write_record
 from splatgraft.runtime.note import Note
+from splatgraft.segmentation import SolidifyOptions
 from splatgraft.workflow.flow import read_flow
 
 
@@ -37,6 +39,7 @@ def test_a_first_transfer_needs_nothing_but_two_captures(
     monkeypatch.setenv("DISPLAY", ":0")
     assert first_try.DRAFT == {"quality": "draft"}
     monkeypatch.setattr(first_try, "DRAFT", {"quality": "draft", "iterations": 60, "budget": 400})
+    monkeypatch.setattr(segment, "SolidifyOptions", lambda steps, **more: SolidifyOptions(min(steps, 60), **more))
     assert main(["try", *captures, "--draft"]) == 0
     printed = capsys.readouterr()
     page = Path("images__into_room") / "report" / "index.html"

@@ -228,6 +228,7 @@ def set_the_sun(window: Window, page: Page, pairs: Sequence[tuple[torch.Tensor, 
     return light.sources[0]
 
 
+@pytest.mark.long
 def test_two_clicks_set_the_sun_and_undo_takes_it_back(browser: Any, tmp_path: Path) -> None:
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     project = with_given_light(scene_project(tmp_path, target=sunlit_scene(sun, 3.0)))

@@ -29,6 +29,7 @@ def editor(folder, said=None, **other):
     return make_harmonizer(options, HarmonizerContext(say=(said if said is not None else []).append))
 
 
+@pytest.mark.long
 def test_the_pipeline_edits_near_the_object_alone_with_one_seed_for_all_views(folder):
     said, shown = [], view(64, 96)
     shown.mask.zero_()
