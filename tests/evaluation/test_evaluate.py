@@ -74,6 +74,8 @@ def test_a_view_of_the_whole_object_is_shown_before_a_larger_one_that_is_cut() -
     assert max((cut, tiny), key=lambda p: p.prominence) is cut
     # nor one of the side that no photograph shows
     assert max((replace(whole, guessed_share=0.5), small), key=lambda p: p.prominence) is small
+    # though it be twice as large
+    assert max((replace(at("large", 20, 14), guessed_share=0.4), small), key=lambda p: p.prominence) is small
 
 
 def test_the_best_view_is_sought_among_all_cameras() -> None:

@@ -24,6 +24,8 @@ from splatgraft.runtime.lazy_sequence import LazySequence
 
 _CUT_OBJECT = 0.05
 """What the coverage of an object counts that the picture's rim cuts; set by hand."""
+_GUESSED_POWER = 4
+"""Of the share that was photographed: a view that shows a fifth of guesses counts four tenths; set by hand."""
 _LOOK_PX, _LOOKED_AT = 160, 40
 """Longest side at which views are looked at for the best one, and how many at most."""
 
@@ -51,8 +53,8 @@ class Pictures:
 
     @property
     def prominence(self) -> float:
-        """How well the view shows the object: its coverage as photographed, pixels; a twentieth of it where the
-        picture's rim cuts it."""
+        """How well the view shows the object: its coverage, pixels, the less the more of it no photograph shows; a
+        twentieth of it where the picture's rim cuts it."""
         return _prominence(self.mask, self.guessed_share)
 
 
@@ -137,7 +139,7 @@ class EvaluatedScenes:
 def _prominence(mask: Float[Tensor, "h w"], guessed_share: float) -> float:
     rim = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
     cut = _CUT_OBJECT if bool((rim > 0.5).any()) else 1.0
-    return float(mask.sum()) * (1 - guessed_share) * cut
+    return float(mask.sum()) * (1 - guessed_share) ** _GUESSED_POWER * cut
 
 
 @dataclass(frozen=True)
