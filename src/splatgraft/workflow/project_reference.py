@@ -156,7 +156,7 @@ def project_keys() -> tuple[KeyTable, ...]:
     """Every table of project.toml with all its keys: name, type, default and meaning, in the order of the flow.
 
     Paths of results are relative to the folder of project.toml. [source.reconstruct] and [target.reconstruct] take the
-    keys of [reconstruct] for one capture alone.
+    keys of [reconstruct] for one capture alone; the source is a draft unless its own table gives a quality.
     """
     given = default_paths(Layout(Path()))
     sides = tuple(KeyTable(side, meaning, _SIDE_KEYS) for side, meaning in _CAPTURE_KEYS.items())
@@ -177,6 +177,10 @@ _HEAD = """\
 # A splatgraft project with every key. A line such as `#key = value` is a key that is not set; the value is its default,
 # or an example where the default is none. Paths are relative to this file.
 """
+_OF_ONE_CAPTURE = (
+    "[source.reconstruct] and [target.reconstruct] take these keys for one capture alone. The source is a draft unless "
+    "its own table gives a quality, as the object is fitted again."
+)
 _WIDTH = 118
 
 
@@ -192,7 +196,7 @@ def full_project_text(*, source: str, target: str) -> str:
         if table.name in named:
             lines.append(named[table.name])
         if table.name == "reconstruct":
-            lines += _prose("[source.reconstruct] and [target.reconstruct] take these keys for one capture alone.")
+            lines += _prose(_OF_ONE_CAPTURE)
         for key in table.keys:
             if f"{key.name} = " not in named.get(table.name, ""):
                 lines += _key_lines(key)
