@@ -8,7 +8,7 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
-from splatgraft.core.exposure import Exposure, describe_inconsistency, luminance_scale
+from splatgraft.core.exposure import Exposure, describe_inconsistency, luminance_scale, relative_gains
 from splatgraft.formats.captures.exif import exif_of, read_exposure
 
 PHONE = {
@@ -145,3 +145,13 @@ def test_settings_are_written_as_photographers_do():
     assert str(Exposure(2.5, 11.0, 64.0)) == "2.5 s f/11 ISO 64"
     assert str(Exposure(brightness_stops=2.0)) == "EV 7.0"
     assert str(Exposure()) == "unknown settings"
+
+
+def test_a_photo_exposed_longer_is_brighter_by_its_settings():
+    short, long_, unknown = Exposure(1 / 120, 2.0, 100.0), Exposure(1 / 30, 2.0, 100.0), Exposure()
+    gains = relative_gains([short, long_, unknown])
+    # two stops are a factor of four on linear light
+    assert gains[1] / gains[0] == pytest.approx(4 ** (1 / 2.2))
+    assert sum(gains) == pytest.approx(3)
+    assert gains[0] < gains[2] < gains[1]
+    assert relative_gains([unknown, unknown]) == [1.0, 1.0]

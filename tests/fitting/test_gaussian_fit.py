@@ -110,6 +110,19 @@ def test_colours_that_differ_between_views_do_not_enter_the_scene():
     assert errors[1] < 0.7 * errors[0]
 
 
+def test_views_that_are_brighter_from_one_side_do_not_make_the_scene_brighter_from_there():
+    truth = blobs(60, seed=3)
+    truth = replace(truth, sh=torch.cat([truth.sh[:, :1], torch.zeros(60, 3, 3)], 1))
+    gains = (1.3, 1.3, 1.3, 0.7, 0.7, 0.7)
+    views, grey = views_of(truth, gains), replace(truth, sh=torch.zeros_like(truth.sh))
+    # how much the scene's look depends on the direction
+    bands = []
+    for known in (None, gains):
+        rates = LearningRates(sh=0.02, sh_higher=0.02, view_colors=0.003)
+        bands.append(float(fit(grey, views, FitOptions(180, rates, view_gains=known)).sh[:, 1:].abs().mean()))
+    assert bands[1] < 0.7 * bands[0]
+
+
 def test_a_random_background_leaves_no_holes_before_what_is_dark():
     dark, cameras = replace(blobs(60, 4), sh=torch.full((60, 4, 3), -0.5)), ring(6)
     views = as_views(cameras, [torch.zeros(32, 32, 3)] * 6)
