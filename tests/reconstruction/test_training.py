@@ -6,16 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 from memory_checkpoint import KilledError, MemoryCheckpoint
-from PIL import Image
 from shapes import random_scene
 
 from splatgraft.core import cameras as camera_values
-from splatgraft.core.exposure import Exposure
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.image_metrics import psnr
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.formats.captures.exif import exif_of
 from splatgraft.reconstruction import (
     ReconstructOptions,
     describe_duration,
@@ -92,20 +89,6 @@ def test_held_out_views_change_nothing(capture, tmp_path):
     one, other = reconstruct(capture, options), reconstruct(replace(capture, image_paths=paths), options)
     for name in FIELDS:
         assert torch.equal(getattr(one, name), getattr(other, name)), name
-
-
-def test_photos_settings_count_where_their_colours_are_fitted(capture, tmp_path):
-    settings = [Exposure(1 / 30 if i < 8 else 1 / 90, 2.0, 100.0) for i in range(16)]
-    scenes = []
-    for known, fitted in ((True, True), (False, True), (True, False), (False, False)):
-        paths = tuple(tmp_path / f"{known}{i}.jpg" for i in range(16))
-        for index, path in enumerate(paths):
-            pixels = (255 * capture.image(index)).round().to(torch.uint8).numpy()
-            Image.fromarray(pixels).save(path, exif=exif_of(settings[index] if known else Exposure()))
-        options = ReconstructOptions(iterations=12, budget=200, sh_degree=0, photo_colors=fitted)
-        scenes.append(reconstruct(replace(capture, image_paths=paths), options).sh)
-    assert not torch.equal(scenes[0], scenes[1])
-    assert torch.equal(scenes[2], scenes[3])
 
 
 def watched_counts(capture: PosedImages, budget: int) -> list[float]:

@@ -13,12 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.exposure import relative_gains
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.fitting.density import DensityControl
 from splatgraft.fitting.gaussian_fit import FitOptions, FitState, LearningRates, Step, fit
-from splatgraft.formats.captures.exif import read_exposure
 from splatgraft.reconstruction.image_pyramid import read_pyramid
 from splatgraft.reconstruction.initialization import (
     SeedPoints,
@@ -116,8 +114,7 @@ def reconstruct(
         return replace(state, gaussians=wider, moments=state.moments.padded("sh", wider.sh.shape[1]))
 
     background = None if surroundings else options.background
-    gains = relative_gains([read_exposure(path) for path in capture.image_paths]) if options.photo_colors else None
-    how = FitOptions(options.all_iterations, _rates(capture.cameras, options), background, gains, options.seed)
+    how = FitOptions(options.all_iterations, _rates(capture.cameras, options), background, seed=options.seed)
     fitted = fit(start, views, how, control=control, progress=progress, checkpoint=checkpoint)
     return fitted.with_sh_degree(options.sh_degree)
 
