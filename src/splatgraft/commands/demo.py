@@ -44,7 +44,7 @@ class Demo:
     cores, nothing is downloaded."""
 
     folder: Positional = Path("splatgraft_demo")
-    """Folder of the project, made where it does not exist; 130 MB when the demo is done."""
+    """Folder of the project, made where it does not exist; 150 MB when the demo is done."""
     width: int = 1280
     """Width of the report's pictures, pixels."""
     iterations: int = 2000
