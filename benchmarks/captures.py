@@ -30,16 +30,14 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as cli.py does; read when
 import torch
 
 from splatgraft.commands.steps.segment import SOLID_SIDE_PX
-from splatgraft.core.exposure import describe_inconsistency, relative_gains
 from splatgraft.core.flip import flip
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import fit_color, psnr, ssim
 from splatgraft.core.images import list_images
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.folders.capture_files import has_poses
+from splatgraft.folders.capture_files import has_poses, read_view_gains
 from splatgraft.folders.object_masks import with_mask_folder
 from splatgraft.formats import read_capture
-from splatgraft.formats.captures.exif import read_exposure
 from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
@@ -88,12 +86,13 @@ def measure(name: str, args: argparse.Namespace) -> None:
     if not args.object:
         return
     photos = with_mask_folder(capture, args.masks, args.folder).limited(SOLID_SIDE_PX)
-    testing = torch.tensor([n in held_out_names(capture) for n in photos.cameras.names])
-    exposures = [read_exposure(path) for path in photos.select(~testing).image_paths]
-    gains = None if describe_inconsistency(exposures) is None else relative_gains(exposures)
-    for what, solidify in (("cut", None), ("object", SolidifyOptions(view_gains=gains))):
+    not_fitted = set(capture.select(held_out(len(capture), EVERY)).cameras.names)
+    testing = torch.tensor([name in not_fitted for name in photos.cameras.names])
+    training = photos.select(~testing)
+    fitted = SolidifyOptions(view_gains=read_view_gains(training.image_paths))
+    for what, solidify in (("cut", None), ("object", fitted)):
         begin, begin_cpu = time.perf_counter(), time.process_time()
-        found = segment(scene, photos.select(~testing), solidify=solidify).object
+        found = segment(scene, training, solidify=solidify).object
         cost = cost_since(begin, begin_cpu, found)
         print(f"{line} {what} {compare_object(found, photos.select(testing))} {cost}", flush=True)
 
@@ -102,11 +101,6 @@ def cost_since(begin: float, begin_cpu: float, made: Gaussians) -> str:
     """The part of the line that says what something took."""
     seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     return f"seconds={seconds:.0f} cpu_seconds={cpu:.0f} gaussians={made.count}"
-
-
-def held_out_names(capture: PosedImages) -> set[str]:
-    """Names of the photos that were not fitted."""
-    return set(capture.select(held_out(len(capture), EVERY)).cameras.names)
 
 
 def compare(scene: Gaussians, photos: PosedImages) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatgraft.core.exposure import LuminanceScale, describe_inconsistency, luminance_scale
+from splatgraft.core.exposure import LuminanceScale, describe_inconsistency, luminance_scale, relative_gains
 from splatgraft.core.images import list_images, mean_luminance
 from splatgraft.core.posed_images import LeftOut, PosedImages
 from splatgraft.formats import list_capture_images
@@ -88,6 +88,12 @@ def exposure_notes(name: Path, photos: Sequence[Path]) -> list[Note]:
     """At most one warning that starts with `name`: exposures of photos differ, or white balance was automatic."""
     found = describe_inconsistency([read_exposure(photo) for photo in photos])
     return [] if found is None else [Note(f"{name}: {found}", "minor")]
+
+
+def read_view_gains(photos: Sequence[Path]) -> list[float] | None:
+    """The brightness of each photo over their mean by its settings; None where exposure and white balance are alike."""
+    exposures = [read_exposure(photo) for photo in photos]
+    return None if describe_inconsistency(exposures) is None else relative_gains(exposures)
 
 
 def read_luminance_scale(cameras: Path) -> LuminanceScale | None:

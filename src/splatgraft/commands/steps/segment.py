@@ -14,11 +14,10 @@ from torch import Tensor
 from splatgraft.composition import Coverage
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.core.exposure import describe_inconsistency, relative_gains
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import resize, write_image
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.folders.capture_files import capture_inputs
+from splatgraft.folders.capture_files import capture_inputs, read_view_gains
 from splatgraft.folders.object_masks import (
     CUT_SIDE_PX,
     CutRequest,
@@ -32,7 +31,6 @@ from splatgraft.folders.object_masks import (
 )
 from splatgraft.folders.picture_points import prompts_by_view
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
-from splatgraft.formats.captures.exif import read_exposure
 from splatgraft.formats.gaussian_flags import read_corrections, write_flags
 from splatgraft.formats.prompts import read_prompts
 from splatgraft.project.layout import COVERAGE_FILE, IS_GUESSED_FILE, OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
@@ -154,9 +152,8 @@ class Segment:
         chosen = scene.select(selection)
         if self.solidify and masked is not None:
             views, photographs = _photographs(masked)
-            exposures = [read_exposure(path) for path in views.image_paths]
-            gains = None if describe_inconsistency(exposures) is None else relative_gains(exposures)
-            options, cameras = SolidifyOptions(self.solidify, view_gains=gains), views.cameras.to(device)
+            options = SolidifyOptions(self.solidify, view_gains=read_view_gains(views.image_paths))
+            cameras = views.cameras.to(device)
             chosen = solidify_object(scene, selection, cameras, photographs, options=options, progress=context.progress)
             context.console.say(f"object, made solid: {chosen.count:,} Gaussians")
         is_guessed = torch.zeros(chosen.count, dtype=torch.bool)
