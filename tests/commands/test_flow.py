@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -56,6 +57,12 @@ def test_everything_is_made_and_fresh_wherever_the_project_lies(
     assert torch.equal(relit.sh, result.sh)
     for name in ("index.html", "before.png", "after.png", "turntable.gif"):
         assert (layout.report / name).is_file()
+    page = (layout.report / "index.html").read_text()
+    assert "<h2>Depth and normals</h2>" in page
+    for label in ("Depth", "Normals"):
+        (name,) = re.findall(rf'src="(geometry/0000_\d\.webp)" alt="{label} ', page)
+        # the plane and the ball are in it: several colours
+        assert read_rgb(layout.report / name).flatten(0, 1).std(0).max() > 0.05
     record = read_record(layout.harmonized)
     assert record is not None
     assert record.options == {"method": "none"}

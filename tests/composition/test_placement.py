@@ -7,8 +7,10 @@ import pytest
 import torch
 from shapes import UP
 
+from splatgraft.cli import main
 from splatgraft.composition import (
     Coverage,
+    NoFreePlaceError,
     PlaceOptions,
     compose,
     hidden_fraction,
@@ -18,12 +20,16 @@ from splatgraft.composition import (
     support_below,
 )
 from splatgraft.composition.placement import facing_yaw_deg
+from splatgraft.composition.places import scale_in_view
 from splatgraft.composition.support_surface import height_map
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.capture_orientation import estimate_up, focus_point
 from splatgraft.core.gaussians import Gaussians, concatenate, empty
+from splatgraft.core.images import read_rgb
+from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
+from splatgraft.formats import write_capture, write_gaussians
 
 TABLE = 0.7
 
@@ -411,3 +417,110 @@ def test_corners_do_not_reach_over_the_table_s_edge():
     placed = place_object(room(), thing, cameras=(cameras, cameras), options=PlaceOptions(scale=1.0, yaw_deg=0.0))
     corners = placed.target_from_object.points(thing.means)
     assert corners[:, 0].max() < 0.6
+
+
+def heap(radius, low, high, *, at=(0.0, 0.0), seed=0):
+    """Small Gaussians on the side and on the flat top of a cylinder."""
+    g = torch.Generator().manual_seed(seed)
+    n = 1500
+    angle, share = 2 * math.pi * torch.rand(n, generator=g), torch.rand(n, generator=g)
+    is_top = torch.arange(n) < n // 2
+    across = radius * torch.where(is_top, share.sqrt(), 1.0)
+    height = torch.where(is_top, high, low + share * (high - low))
+    return Gaussians(
+        means=torch.stack([at[0] + across * angle.cos(), at[1] + across * angle.sin(), height], 1),
+        log_scales=torch.full((n, 3), math.log(0.012)),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        opacity_logits=torch.full((n,), 4.0),
+        sh=torch.zeros(n, 1, 3),
+    )
+
+
+SHOULDER = TABLE + 0.6
+"""Height of the flat shoulder of the captured figure; the cameras look at a point just below it."""
+
+
+def figure_on_a_table():
+    """A figure with a flat shoulder and a head, on a wide table above a floor; darker and lighter for the picture."""
+    floor = sheet((0, 0, 0), (2, 0, 0), (0, 2, 0))
+    table = sheet((0, 0, TABLE), (0.9, 0, 0), (0, 0.75, 0), spacing=0.03)
+    head = heap(0.07, SHOULDER, SHOULDER + 0.2, at=(-0.14, 0.0), seed=1)
+    parts = (floor, table, heap(0.22, TABLE, SHOULDER), head)
+    return concatenate(
+        [replace(part, sh=part.sh + tone) for part, tone in zip(parts, (-1.2, 0.5, -0.3, -0.3), strict=True)]
+    )
+
+
+def cameras_that_look_at_the_figure():
+    return ring_of_cameras((0.0, 0, SHOULDER - 0.02))
+
+
+SLENDER = box((0, 0, 0.15), (0.04, 0.04, 0.15), spacing=0.02)
+"""An object that would have room on the figure's shoulder."""
+
+
+def test_an_object_stands_beside_the_captured_figure_on_its_table():
+    cameras = cameras_that_look_at_the_figure()
+    for thing in (SLENDER, THING):
+        placed = place_object(figure_on_a_table(), thing, cameras=(cameras, OWN))
+        assert abs(float(placed.support.point[2]) - TABLE) < 0.02
+        scale = placed.target_from_object.scale
+        guess = scale_in_view(placed.base, torch.tensor([0.0, 0, SHOULDER - 0.02]), cameras=cameras)
+        assert scale >= 0.5 * guess
+        # neither into the figure nor over the table's edge
+        assert placed.support.point[:2].norm() > 0.22 + scale * placed.base.radius
+        assert placed.support.point[0].abs() < 0.9 - scale * placed.base.radius
+        assert placed.support.point[1].abs() < 0.75 - scale * placed.base.radius
+        assert not any(note.in_doubt for note in placed.warnings)
+
+
+def test_a_bare_table_is_the_support_of_cameras_that_meet_below_it():
+    # by a sixteenth of their distance, as those of a hand do; the floor has four times the area
+    cameras = ring_of_cameras((0.0, 0, TABLE - 0.1))
+    placed = place_object(room(), THING, cameras=(cameras, OWN))
+    assert abs(float(placed.support.point[2]) - TABLE) < 0.02
+
+
+def full_table():
+    """The figure among things that leave gaps too small for the object, above a free floor."""
+    angle = torch.arange(10) / 10 * 2 * math.pi
+    things = [
+        heap(0.09, TABLE, TABLE + 0.15, at=(0.45 * math.cos(a), 0.45 * math.sin(a)), seed=10 + i)
+        for i, a in enumerate(angle.tolist())
+    ]
+    table = sheet((0, 0, TABLE), (0.54, 0, 0), (0, 0.54, 0), spacing=0.03)
+    floor = sheet((0, 0, 0), (2, 0, 0), (0, 2, 0))
+    return concatenate([replace(floor, sh=floor.sh - 1.2), table, heap(0.22, TABLE, SHOULDER), *things])
+
+
+def test_a_table_too_full_for_half_of_the_guess_is_refused_with_a_picture(tmp_path, capsys):
+    cameras = cameras_that_look_at_the_figure()
+    with pytest.raises(
+        NoFreePlaceError, match=r"at half of its guessed size or more, found one for \d\d% of it"
+    ) as error:
+        place_object(full_table(), THING, cameras=(cameras, OWN))
+    # green is where the free rim of the table is seen, red is the figure in the middle, the floor keeps its gray
+    tint = error.value.picture[..., 1] - error.value.picture[..., 0]
+    assert float((tint > 0.1).float().mean()) > 0.01
+    assert tint[50:70, 75:85].max() < -0.1
+    assert (tint[:, :5].abs() < 0.01).all()
+    # a scale that is given is never refused
+    placed = place_object(full_table(), THING, cameras=(cameras, OWN), options=PlaceOptions(scale=1.0))
+    assert abs(float(placed.support.point[2])) < 0.02
+    assert any("lower level" in note.text for note in placed.warnings)
+    write_gaussians(tmp_path / "target.ply", full_table())
+    write_gaussians(tmp_path / "object.ply", THING)
+    for name, seen in (("cameras", cameras), ("object-cameras", OWN)):
+        images = tuple(tmp_path / f"{image}.png" for image in seen.names)
+        (tmp_path / name).mkdir()
+        write_capture(tmp_path / name, PosedImages(images, seen, torch.zeros(0, 3), torch.zeros(0, 3)))
+    paths = {"target": "target.ply", "object": "object.ply", "cameras": "cameras", "object-cameras": "object-cameras"}
+    words = ["compose", *(x for key, path in paths.items() for x in (f"--{key}", str(tmp_path / path)))]
+    words += ["--out", str(tmp_path / "composite")]
+    picture = tmp_path / "composite_free_places.png"
+    assert main(words) == 2
+    assert f"name a place (--at or --on) or a size (--scale); {picture} shows" in capsys.readouterr().err
+    assert read_rgb(picture).shape == (120, 160, 3)
+    assert not (tmp_path / "composite").exists()
+    assert main([*words, "--scale", "1.0"]) == 0
+    assert not picture.exists()

@@ -57,7 +57,7 @@ def test_page_is_whole_and_self_contained(tmp_path):
         limits=("Clipped light is guessed.",),
     )
     frames = list(pictures().values())
-    page = write_report(tmp_path, report, views=iter(example_views()), turntable=frames)
+    page = write_report(tmp_path, report, views=iter(example_views()), geometry=example_views(2), turntable=frames)
     text = page.read_text()
     links = _Links()
     links.feed(text)
@@ -70,6 +70,7 @@ def test_page_is_whole_and_self_contained(tmp_path):
     assert "not measured: no weights" in text
     assert "1 min 15 s" in text
     assert len(list((tmp_path / "views").iterdir())) == 9
+    assert len([link for link in links.links if link.startswith("geometry/")]) == 6
 
 
 def test_without_truth_no_score_is_shown(tmp_path):
@@ -78,6 +79,7 @@ def test_without_truth_no_score_is_shown(tmp_path):
     assert "PSNR" not in text
     assert "without ground truth" in text
     assert "1.50 x" in text
+    assert "Depth and normals" not in text
     assert not (tmp_path / "metrics.json").exists()
 
 

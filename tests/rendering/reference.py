@@ -24,6 +24,21 @@ def projection(
     depth = x_in_camera[:, 2]
     slope = x_in_camera[:, :2] / depth[:, None]
     focal, principal = torch.stack([k[0, 0], k[1, 1]]), k[:2, 2]
+    sharp = covariance_on_screen(gaussians, camera)[:, :2, :2]
+    blurred = sharp + 0.3 * torch.eye(2).to(sharp)
+    opacity = gaussians.opacities
+    if options.low_pass == "antialiased":
+        opacity = opacity * (torch.linalg.det(sharp).clamp_min(1e-12) / torch.linalg.det(blurred)).sqrt()
+    return slope * focal + principal, blurred, opacity, depth
+
+
+def covariance_on_screen(gaussians: Gaussians, camera: Cameras) -> Float[Tensor, "n 3 3"]:
+    """Covariances of pixel x, pixel y and inverse depth, linearised at the centres."""
+    pose, k = camera.camera_from_world[0].to(gaussians.means), camera.intrinsics[0].to(gaussians.means)
+    x_in_camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
+    depth = x_in_camera[:, 2]
+    slope = x_in_camera[:, :2] / depth[:, None]
+    focal, principal = torch.stack([k[0, 0], k[1, 1]]), k[:2, 2]
     size = camera.sizes[0].to(slope)
     margin = 0.15 * size / focal
     held = torch.maximum(torch.minimum(slope, (size - principal) / focal + margin), -principal / focal - margin)
@@ -32,16 +47,24 @@ def projection(
         [
             torch.stack([focal[0] / depth, zero, -focal[0] * held[:, 0] / depth], -1),
             torch.stack([zero, focal[1] / depth, -focal[1] * held[:, 1] / depth], -1),
+            torch.stack([zero, zero, -1 / depth**2], -1),
         ],
         1,
     )
-    to_pixels = jacobian @ pose[:3, :3]
-    sharp = to_pixels @ gaussians.covariances @ to_pixels.transpose(1, 2)
-    blurred = sharp + 0.3 * torch.eye(2).to(sharp)
-    opacity = gaussians.opacities
-    if options.low_pass == "antialiased":
-        opacity = opacity * (torch.linalg.det(sharp).clamp_min(1e-12) / torch.linalg.det(blurred)).sqrt()
-    return slope * focal + principal, blurred, opacity, depth
+    to_screen = jacobian @ pose[:3, :3]
+    return to_screen @ gaussians.covariances @ to_screen.transpose(1, 2)
+
+
+def inverse_depths(
+    gaussians: Gaussians, camera: Cameras, options: RenderOptions
+) -> tuple[Float[Tensor, "h w n"], Float[Tensor, "n"]]:
+    """Mean of each Gaussian's inverse depth in each pixel, and its variance there."""
+    center, blurred, _, depth = projection(gaussians, camera, options)
+    covariance = covariance_on_screen(gaussians, camera)
+    slope = torch.einsum("nij,nj->ni", torch.linalg.inv(blurred), covariance[:, :2, 2])
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    away = torch.stack([x, y], -1)[:, :, None].to(center) - center
+    return 1 / depth + (away * slope).sum(-1), covariance[:, 2, 2] - (slope * covariance[:, :2, 2]).sum(1)
 
 
 def weights(
@@ -71,14 +94,16 @@ def render(
 ) -> Render:
     """Every output for one camera; `visible` where a Gaussian has weight in a pixel."""
     weight, order = weights(gaussians, camera, options)
-    _, _, _, depth = projection(gaussians, camera, options)
+    inverse, variance = (x[..., order] for x in inverse_depths(gaussians, camera, options))
     offset = gaussians.means - camera.centers[0].to(gaussians.means)
     colors = spherical_harmonics.colors(gaussians.sh, torch.nn.functional.normalize(offset, dim=-1))
     axis = gaussians.log_scales.detach().argmin(-1)
     normal = gaussians.rotations[torch.arange(gaussians.count), :, axis]
     normal = torch.where((normal * offset).sum(-1, keepdim=True) > 0, -normal, normal)
     alpha = weight.sum(-1)
-    blended_depth, blended_normal = weight @ depth[order], weight @ normal[order]
+    blended_normal = weight @ normal[order]
+    covered = weight.cumsum(-1)
+    middle = inverse.gather(-1, (covered > 0.5).int().argmax(-1, keepdim=True))[..., 0]
     background = torch.tensor(options.background).to(alpha)
     visible = torch.zeros(gaussians.count, dtype=torch.bool)
     visible[order] = (weight > 0).any(0).any(0)
@@ -87,7 +112,10 @@ def render(
         visible=visible[None],
         pictures={
             "color": (weight @ colors[order] + (1 - alpha)[..., None] * background)[None],
-            "depth": torch.where(alpha > 0, blended_depth / torch.where(alpha > 0, alpha, 1), 0)[None],
+            "depth": torch.where((covered[..., -1] > 0.5) & (middle > 0), 1 / middle, 0)[None].detach(),
+            "inverse_depth": torch.stack(
+                [(weight * inverse).sum(-1), (weight * (inverse.square() + variance)).sum(-1)], -1
+            )[None],
             "normal": torch.nn.functional.normalize(blended_normal, dim=-1)[None],
             "features": (weight @ features[order])[None],
         },

@@ -41,6 +41,10 @@ def test_pictures_and_gradients_match_the_reference(degree, low_pass):
     for name, tolerance in [("color", 1e-5), ("alpha", 1e-5), ("depth", 1e-4), ("normal", 5e-5), ("features", 2e-5)]:
         ours, theirs = getattr(found, name)[0], getattr(expected, name)[0]
         assert (ours - theirs)[decided].abs().max() < tolerance, name
+        if name == "depth":
+            assert (theirs > 0).any()
+            assert not ours.requires_grad
+            continue
         # faint pixels magnify rounding in depth and normal, which are divided by how much there is
         pixel_weights = torch.randn(ours[decided].shape, generator=generator)
         pixel_weights = torch.einsum("p...,p->p...", pixel_weights, expected.alpha[0][decided].detach().float())
@@ -70,6 +74,63 @@ def test_colour_alone_matches_the_reference():
     for field in fields(Gaussians):
         ours, theirs = getattr(single, field.name).grad, getattr(double, field.name).grad
         assert (ours - theirs).abs().max() < 3e-4 * theirs.abs().max()
+
+
+@pytest.mark.parametrize("low_pass", ["classic", "antialiased"])
+def test_moments_of_inverse_depth_and_their_gradients_match_the_reference(low_pass):
+    options = RenderOptions(low_pass=low_pass)
+    single = random_scene(60, 1, seed=1).map(lambda t: t.requires_grad_())
+    double = single.map(lambda t: t.detach().double().requires_grad_())
+    found = rendering.render(single, camera(), outputs=frozenset({"color", "inverse_depth"}), options=options)
+    expected = reference.render(double, camera(), features=torch.zeros(60, 0).double(), options=options)
+    decided = ~reference.undecided(double, camera(), options)
+    generator = torch.Generator().manual_seed(3)
+    losses = []
+    for ours, theirs in ((found.color, expected.color), (found.inverse_depth, expected.inverse_depth)):
+        # float32 and exp to 1e-6: a pixel sums tens of weights of at most 1
+        assert (ours - theirs)[0][decided].abs().max() < 1e-5
+        pixel_weights = torch.randn(ours.shape, generator=generator) * decided[..., None]
+        losses.append([(pixel_weights * ours).sum(), (pixel_weights * theirs).sum()])
+    for loss in (losses[0][0] + losses[1][0], losses[0][1] + losses[1][1]):
+        loss.backward()
+    for field in fields(Gaussians):
+        ours, theirs = getattr(single, field.name).grad, getattr(double, field.name).grad
+        # the same arithmetic once more, with differences of like numbers: 5 digits of the largest
+        assert (ours - theirs).abs().max() < 5e-5 * theirs.abs().max()
+
+
+def test_a_flat_gaussian_has_the_depth_of_its_plane():
+    # a disc that is slanted by 45 degrees, wide enough to cover the image
+    slanted = rotation_from_quaternion(torch.tensor([[0.9239, 0.3827, 0.0, 0.0]]))[0]
+    disc = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 4.0]]),
+        log_scales=torch.tensor([[2.0, 2.0, 1e-4]]).log(),
+        quaternions=torch.tensor([[0.9239, 0.3827, 0.0, 0.0]]),
+        opacity_logits=torch.tensor([8.0]),
+        sh=torch.zeros(1, 1, 3),
+    )
+    view = Cameras(
+        torch.eye(4)[None], torch.tensor([[[80.0, 0, 32], [0, 80, 24], [0, 0, 1]]]), torch.tensor([[64, 48]]), ("a",)
+    )
+    drawn = rendering.render(disc, view, outputs=frozenset({"color", "depth", "inverse_depth"}))
+    y, x = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
+    rays = torch.stack([(x - 32) / 80, (y - 24) / 80, torch.ones_like(x)], -1)
+    normal = slanted[:, 2]
+    expected = 4 * normal[2] / (rays @ normal)
+    shown = drawn.depth[0] > 0
+    assert shown[18:30, 24:40].all()
+    # the low pass of 0.3 pixels, of a disc 40 pixels wide, takes 2e-4 of the slope; depth changes by 0.7 at most
+    assert (drawn.depth[0] / expected - 1)[shown].abs().max() < 1e-3
+    mean = drawn.inverse_depth[0, ..., 0] / drawn.alpha[0]
+    assert (mean * expected - 1)[shown].abs().max() < 1e-3
+    # one plane: no spread but what the low pass leaves
+    spread = drawn.inverse_depth[0, ..., 1] - drawn.inverse_depth[0, ..., 0].square() / drawn.alpha[0]
+    assert spread[shown].abs().max() < 1e-5
+
+
+def test_inverse_depth_is_not_drawn_with_normals():
+    with pytest.raises(ValueError, match="expected inverse_depth with color and depth alone"):
+        rendering.render(random_scene(3, 0, seed=0), camera(), outputs=frozenset({"inverse_depth", "normal"}))
 
 
 def test_opaque_layers_hide_what_is_behind_them():
@@ -166,7 +227,7 @@ def test_the_same_input_gives_the_same_bits():
     for _ in range(2):
         scene = random_scene(500, 2, seed=2).map(lambda t: t.requires_grad_())
         picture = rendering.render(scene, camera(100, 80), outputs=ALL)
-        (picture.color.sin().sum() + picture.depth.sum() + picture.normal.sum()).backward()
+        (picture.color.sin().sum() + picture.normal.sum()).backward()
         runs.append([picture.color, *(getattr(scene, field.name).grad for field in fields(Gaussians))])
     assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
 
@@ -205,7 +266,7 @@ def test_degenerate_gaussians_do_no_harm(numbers, low_pass):
     scene = concatenate([bad, good]).map(lambda t: t.requires_grad_())
     picture = rendering.render(scene, camera(), outputs=ALL, options=RenderOptions(low_pass=low_pass))
     assert all(getattr(picture, name).isfinite().all() for name in ["color", "alpha", "depth", "normal"])
-    (picture.color.sum() + picture.alpha.sum() + picture.depth.sum() + picture.normal.sum()).backward()
+    (picture.color.sum() + picture.alpha.sum() + picture.normal.sum()).backward()
     assert all(getattr(scene, field.name).grad.isfinite().all() for field in fields(Gaussians))
 
 

@@ -32,7 +32,7 @@ def test_pictures_and_gradients_match_the_cpu(low_pass):
         picture = rendering.render(
             scene, camera().to(device), outputs=ALL, features=features.to(device), options=options
         )
-        (picture.color.mean() + picture.depth.mean() + picture.features.mean()).backward()
+        (picture.color.mean() + picture.features.mean()).backward()
         results.append((picture, scene))
     (ours, our_scene), (theirs, their_scene) = results
     # gsplat caps alpha at 0.999, the CPU at the original's 0.99: a hundredth of one layer
@@ -42,6 +42,34 @@ def test_pictures_and_gradients_match_the_cpu(low_pass):
         ours, theirs = getattr(our_scene, name).grad, getattr(their_scene, name).grad.cpu()
         # the same cause
         assert (ours - theirs).norm() < 0.05 * ours.norm()
+
+
+@pytest.mark.parametrize("low_pass_px2", [0.3, 0.075])
+def test_planes_of_inverse_depth_are_those_of_the_kernels(low_pass_px2):
+    # pure torch, so that it is tested without a GPU: blended by the CPU as features, against the CPU's own moments
+    options, view = RenderOptions(low_pass_px2=low_pass_px2), camera()
+    scene = random_scene(60, 0, seed=2)
+    ours = rendering.render(scene, view, outputs=frozenset({"inverse_depth"}), options=options)
+    channels = cuda.moment_channels(scene, view, options)
+    blended = rendering.render(scene, view, outputs=frozenset(), features=channels, options=options)
+    # float32; sums of up to 0.4
+    assert (cuda.moments(blended.features[0], view) - ours.inverse_depth[0]).abs().max() < 1e-5
+
+
+@needs_gpu
+def test_moments_of_inverse_depth_match_the_cpu():
+    pytest.importorskip("gsplat")
+    found = []
+    for device in ["cpu", "cuda"]:
+        scene = random_scene(200, 1, seed=1).to(device).map(lambda t: t.requires_grad_())
+        picture = rendering.render(scene, camera().to(device), outputs=frozenset({"color", "depth", "inverse_depth"}))
+        picture.inverse_depth.mean().backward()
+        found.append((picture, scene.means.grad))
+    (ours, our_grad), (theirs, their_grad) = found
+    # gsplat caps alpha at 0.999, the CPU at 0.99
+    assert (ours.inverse_depth - theirs.inverse_depth.cpu()).abs().mean() < 5e-3
+    assert torch.equal(ours.depth, theirs.depth.cpu())
+    assert (our_grad - their_grad.cpu()).norm() < 0.05 * our_grad.norm()
 
 
 @needs_gpu

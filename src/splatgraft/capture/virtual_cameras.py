@@ -270,7 +270,8 @@ def _pose_and_occlusion(
     pose = look_at(position.eye[None], position.target, up)
     small = pinhole(pose, 24 / math.tan(_HALF_FOV), width=48, height=36)
     rendered = render(scene, small, outputs=frozenset({"depth"}))
-    depth, alpha = rendered.depth[0], rendered.alpha[0]
+    alpha = rendered.alpha[0]
+    depth = torch.where(rendered.depth[0] > 0, rendered.depth[0], torch.inf)
     close = float((alpha * (depth < position.clear_at_edges)).mean())
     hidden = float((alpha * (depth < position.clear))[12:24, 16:32].mean())
     unseen = 1.0 if float(alpha.mean()) < position.min_seen else 0.0

@@ -3,7 +3,7 @@
 from splatgraft.composition.coverage import Coverage
 from splatgraft.composition.object_base import ObjectBase, object_base, rest_on_surface
 from splatgraft.composition.placement import Placed, PlaceOptions, compose, place_object
-from splatgraft.composition.places import Suggestion, hidden_fraction, suggest_places
+from splatgraft.composition.places import NoFreePlaceError, Suggestion, hidden_fraction, suggest_places
 from splatgraft.composition.support_surface import Support, support_below
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import Composite, PlacedObject
@@ -11,6 +11,7 @@ from splatgraft.core.composite import Composite, PlacedObject
 __all__ = [
     "Composite",
     "Coverage",
+    "NoFreePlaceError",
     "ObjectBase",
     "PlaceOptions",
     "Placed",

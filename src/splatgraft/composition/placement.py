@@ -23,8 +23,7 @@ from splatgraft.runtime.note import Note
 
 # set by hand
 _CLEARLY_BETTER = 1.5
-"""By which factor a later place has to be better: an earlier one is nearer to where the cameras look. With 1.1 a second
-object was put on top of the first."""
+"""By which factor a later place has to be better: an earlier one is nearer to where the cameras look."""
 _YAW_SPREAD_DEG, _YAW_STEP_DEG = 30.0, 5
 """Standard deviation of the azimuth that a photograph covers around its own, and distance of the yaws tried."""
 _GOOD_YAW = 0.98
@@ -36,9 +35,11 @@ class PlaceOptions:
     """What the user decides; what is None is found."""
 
     point: tuple[float, float, float] | None = None
-    """The object is placed on the surface below this point of the target; None finds a visible, level place."""
+    """The object is placed on the surface below this point of the target; None finds a visible, level place beside what
+    was captured there, on the same support."""
     scale: float | None = None
-    """Size in the target over size in the source; None guesses from the views, as captures have no common unit."""
+    """Size in the target over size in the source; None guesses from the views, as captures have no common unit, and
+    takes no less than half of the guess."""
     yaw_deg: float | None = None
     """Rotation about up, counterclockwise seen from above; None turns photographed sides towards the cameras."""
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -85,7 +86,9 @@ def place_object(
         The placement, the surface that it rests on, and warnings.
 
     Raises:
-        ValueError: The object is empty, or there is no surface at all.
+        ValueError: The object is empty, or there is no surface at all; or no place is named, no scale is given, and
+            nothing beside what the target's cameras look at has room for half of the guess (`NoFreePlaceError`, which
+            has a picture).
     """
     target_cameras, source_cameras = cameras
     up = estimate_up(target_cameras)

@@ -1,5 +1,6 @@
 """Evaluation of rendered views: metrics against ground truth, pictures, and the HTML report."""
 
+from splatgraft.evaluation.geometry_pictures import depth_colors, normal_colors, normals_from_depth
 from splatgraft.evaluation.measure import (
     ComparedView,
     Regions,
@@ -25,10 +26,13 @@ __all__ = [
     "TurntableOptions",
     "change_map",
     "compare",
+    "depth_colors",
     "describe_change",
     "evaluate",
     "find_regions",
     "measure",
+    "normal_colors",
+    "normals_from_depth",
     "side_by_side",
     "true_views",
     "turntable_cameras",

@@ -146,18 +146,24 @@ def write_report(
     report: Report,
     *,
     views: Iterable[ReportView],
+    geometry: Iterable[ReportView] = (),
     turntable: Sequence[Float[Tensor, "h w 3"]] = (),
 ) -> Path:
-    """Write index.html with its pictures, one view at a time, and metrics.json where there are metrics."""
-    (folder / "views").mkdir(parents=True, exist_ok=True)
-    files = []
-    for number, view in enumerate(views):
-        paths = {}
-        for place, (label, picture) in enumerate(view.pictures.items()):
-            paths[label] = f"views/{number:04d}_{place}.webp"
-            _write_webp(folder / paths[label], picture)
-        height, width = next(iter(view.pictures.values())).shape[:2]
-        files.append(ViewFiles(name=view.name, held_out=view.held_out, files=paths, width=width, height=height))
+    """Write index.html with its pictures, one view at a time, and metrics.json where there are metrics.
+
+    Args:
+        folder: Where to write.
+        report: Texts and metrics.
+        views: Those that the page compares; it begins with the first.
+        geometry: Result, depth and normals of some views, shown side by side.
+        turntable: Frames around the object.
+
+    Returns:
+        The path of index.html.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    files = [_write_view(folder, f"views/{number:04d}", view) for number, view in enumerate(views)]
+    geometry_files = [_write_view(folder, f"geometry/{number:04d}", view) for number, view in enumerate(geometry)]
     if turntable:
         write_animation(folder / "turntable.webp", turntable)
     for number, warning in enumerate(report.warnings):
@@ -168,8 +174,20 @@ def write_report(
         with atomic_write(folder / "metrics.json") as stream:
             stream.write(json.dumps(report.metrics, indent=1, allow_nan=False).encode())
     with atomic_write(folder / "index.html") as stream:
-        stream.write(_page(report, files, turntable="turntable.webp" if turntable else None).encode())
+        animation = "turntable.webp" if turntable else None
+        stream.write(_page(report, files, geometry=geometry_files, turntable=animation).encode())
     return folder / "index.html"
+
+
+def _write_view(folder: Path, stem: str, view: ReportView) -> ViewFiles:
+    """Write the pictures of one view to files whose names begin with `stem`."""
+    (folder / stem).parent.mkdir(parents=True, exist_ok=True)
+    paths: dict[str, str] = {}
+    for place, (label, picture) in enumerate(view.pictures.items()):
+        paths[label] = f"{stem}_{place}.webp"
+        _write_webp(folder / paths[label], picture)
+    height, width = next(iter(view.pictures.values())).shape[:2]
+    return ViewFiles(name=view.name, held_out=view.held_out, files=paths, width=width, height=height)
 
 
 def _write_webp(path: Path, picture: Float[Tensor, "h w 3"]) -> None:
@@ -178,12 +196,13 @@ def _write_webp(path: Path, picture: Float[Tensor, "h w 3"]) -> None:
         Image.fromarray(array).save(stream, "WEBP", quality=92, method=4)
 
 
-def _page(report: Report, views: Sequence[ViewFiles], *, turntable: str | None) -> str:
+def _page(report: Report, views: Sequence[ViewFiles], *, geometry: Sequence[ViewFiles], turntable: str | None) -> str:
     """Format the page; `turntable` is the animation's file relative to the page."""
     sections = [
         _warnings(report.warnings),
         viewer(views) if views else "",
         _turntable(turntable) if turntable else "",
+        _geometry(geometry) if geometry else "",
         _numbers(report),
         _prose("Light", "light", report.light.splitlines()),
         _steps(report.steps, report.machine),
@@ -218,6 +237,21 @@ def _turntable(file: str) -> str:
 <figure><img class="turntable" src="{escape(file)}" alt="The result seen from a path between the captured cameras">
 <figcaption>The result from viewpoints between the captured ones; none of them was used by any step.</figcaption>
 </figure></section>
+"""
+
+
+def _geometry(views: Sequence[ViewFiles]) -> str:
+    pictures = "".join(
+        f'<figure><img loading="lazy" src="{escape(file)}" alt="{escape(label)} of view {escape(view.name)}">'
+        f"<figcaption>{escape(label)}</figcaption></figure>"
+        for view in views
+        for label, file in view.files.items()
+    )
+    return f"""<section><h2>Depth and normals</h2>
+<p>The surface of the result. Depth goes from yellow (near) to violet (far). Normals are green where a surface faces up
+in the picture, red where it faces right, blue where it faces you; edges are black. A table should be one even ramp:
+islands of another colour are surfaces that the photographs did not fix.</p>
+<div class="geometry">{pictures}</div></section>
 """
 
 

@@ -33,8 +33,9 @@ _SHORT_SCALE = 0.85
 _CHILD_OPACITY = 0.6
 """Opacity of a child over the parent's."""
 _MIN_CHILD_OPACITY = 1.2 * _DEAD_OPACITY
-_MAX_SCALE = 0.5
-"""Bound on the standard deviation, over the distance to the nearest camera."""
+_MAX_SCALE = 0.125
+"""Bound on the standard deviation, over the distance to the nearest camera. A larger one beside a view reaches the
+camera's plane, where the affine projection spreads it over the whole picture."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,8 @@ class DensityControl:
     def update(self, state: FitState, step: Step) -> FitState:
         """Add the step's gradient to the scores; when due, remove transparent Gaussians and split the highest."""
         if state.iteration > self.stop:
-            return replace(state, memory={}) if state.memory else state
+            state = replace(state, memory={}) if state.memory else state
+            return state if state.iteration % self.every else self._limit_scales(state)
         memory = self._with_step(state, step)
         if state.iteration % self.every:
             return replace(state, memory=memory)

@@ -18,7 +18,8 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting import adam
 from splatgraft.fitting.photometric import l1_dssim
-from splatgraft.rendering import RenderOptions, render
+from splatgraft.fitting.surface_loss import SurfaceLoss
+from splatgraft.rendering import Output, RenderOptions, render
 from splatgraft.runtime.process import interruption_held
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
@@ -143,6 +144,8 @@ class FitOptions:
     """sRGB behind the scene; None: another one at every step, so that what is dark has no holes."""
     view_gains: Sequence[float] | None = None
     """Brightness of each view over their mean, from which the views' colours start; None: the same for all."""
+    surfaces: SurfaceLoss | None = None
+    """Losses on depth; None: none."""
     seed: int = 0
     """Of the order of views and of the backgrounds."""
 
@@ -276,7 +279,8 @@ def _stepped(state: FitState, views: Views, options: FitOptions) -> tuple[FitSta
     view = views.at(index, visit=visit, done=done)
     rendering = RenderOptions(background=_background(options, state.iteration), low_pass_px2=view.low_pass_px2)
     leaves = {name: getattr(state.gaussians, name).detach().requires_grad_() for name in names}
-    drawn = render(replace(state.gaussians, **leaves), view.camera, options=rendering)
+    outputs: frozenset[Output] = frozenset({"color"} if options.surfaces is None else {"color", "inverse_depth"})
+    drawn = render(replace(state.gaussians, **leaves), view.camera, outputs=outputs, options=rendering)
     fits_colors = rates.view_colors > 0
     colors = state.view_colors.of(index).requires_grad_(fits_colors)
     picture, background = drawn.color[0], torch.tensor(rendering.background, device=colors.device)
@@ -284,6 +288,9 @@ def _stepped(state: FitState, views: Views, options: FitOptions) -> tuple[FitSta
         picture, background = (x @ colors[:, :3].T + colors[:, 3] for x in (picture, background))
     target = view.target(background, picture)
     loss = l1_dssim(picture, target)
+    if options.surfaces is not None:
+        drawing, photo = _generator(options.seed, state.iteration, plus=2), target.detach()
+        loss = loss + options.surfaces.loss(drawn.inverse_depth[0], drawn.alpha[0], photo, done=done, generator=drawing)
     value = float(loss.detach())
     if not math.isfinite(value):
         raise _diverged(state, f"a loss of {value}")

@@ -17,6 +17,7 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.fitting.density import DensityControl
 from splatgraft.fitting.gaussian_fit import FitOptions, FitState, LearningRates, Step, fit
+from splatgraft.fitting.surface_loss import SurfaceLoss
 from splatgraft.reconstruction.image_pyramid import read_pyramid
 from splatgraft.reconstruction.initialization import (
     SeedPoints,
@@ -113,8 +114,13 @@ def reconstruct(
         wider = state.gaussians.with_sh_degree(degree)
         return replace(state, gaussians=wider, moments=state.moments.padded("sh", wider.sh.shape[1]))
 
-    background = None if surroundings else options.background
-    how = FitOptions(options.all_iterations, _rates(capture.cameras, options), background, seed=options.seed)
+    how = FitOptions(
+        options.all_iterations,
+        _rates(capture.cameras, options),
+        background=None if surroundings else options.background,
+        surfaces=SurfaceLoss(unit=looked_at(capture.cameras)[1]),
+        seed=options.seed,
+    )
     fitted = fit(start, views, how, control=control, progress=progress, checkpoint=checkpoint)
     return fitted.with_sh_degree(options.sh_degree)
 

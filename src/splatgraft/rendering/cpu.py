@@ -1,5 +1,6 @@
 """Rendering on the CPU: numba kernels for projection, tile lists and blending, as torch autograd functions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,9 +11,11 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.rendering import cpu_blend, cpu_frozen, cpu_project, cpu_tiles
+from splatgraft.rendering import cpu_blend, cpu_depth, cpu_frozen, cpu_project, cpu_tiles
 from splatgraft.rendering.interface import CHANNEL_COUNTS, Output, Render, RenderOptions, assemble_render
 from splatgraft.runtime.kernels import KERNEL_LOCK
+
+_DEPTHS: frozenset[Output] = frozenset({"depth", "inverse_depth"})
 
 
 def render(
@@ -27,8 +30,8 @@ def render(
     extra = gaussians.means.new_zeros(gaussians.count, 0) if features is None else features
     fields = [t.float() for t in (*_geometry(gaussians), gaussians.sh, extra)]
     views = [_RenderView.apply(_View.of(camera, options), outputs, *fields) for camera in cameras]
-    image, alpha, visible = (_stack(parts) for parts in zip(*views, strict=True))
-    return assemble_render(image, alpha, visible, outputs=outputs, has_features=features is not None, options=options)
+    image, alpha, depth, visible = (_stack(parts) for parts in zip(*views, strict=True))
+    return assemble_render(image, alpha, depth, visible, outputs=outputs, options=options)
 
 
 def _stack(parts: tuple[Tensor, ...]) -> Tensor:
@@ -78,8 +81,8 @@ class _TileLists:
     """(m,) Gaussian of each splat."""
     splats: np.ndarray
     """(m, 8) in the order of `order`."""
-    depths: np.ndarray
-    """(n,) along the optical axis; set where visible; empty in lists without hidden splats."""
+    inverse_depths: np.ndarray
+    """(m, 4) in the order of `order`: `cpu_project.DEPTH_COLUMNS`; empty where they were not asked for."""
     start: np.ndarray
     """(tiles + 1,) where each tile's list begins in `entries`."""
     entries: np.ndarray
@@ -92,13 +95,17 @@ class _TileLists:
     """(e, 2) uint8, first and one past the last row of the tile that counts; empty: as far as the splat reaches."""
 
     @staticmethod
-    def of(view: _View, means: np.ndarray, log_scales: np.ndarray, quaternions: np.ndarray, logits: np.ndarray):
-        splats, depths = np.empty((len(means), cpu_project.COLUMNS), np.float32), np.zeros(len(means), np.float32)
-        cpu_project.project(means, log_scales, quaternions, logits, view.numbers, view.antialiased, splats, depths)
+    def of(view: _View, geometry: Sequence[np.ndarray], *, with_depth: bool = False) -> "_TileLists":
+        count = len(geometry[0])
+        splats, depths = np.empty((count, cpu_project.COLUMNS), np.float32), np.zeros(count, np.float32)
+        inverse_depths = np.empty((count if with_depth else 0, cpu_project.DEPTH_COLUMNS), np.float32)
+        cpu_project.project(*geometry, view.numbers, view.antialiased, splats, depths, inverse_depths)
         order = cpu_tiles.depth_order(splats, depths)
         packed, start, entries, slots, first = cpu_tiles.bin_splats(splats, order, view.width, view.height)
+        packed_depths = np.empty((len(order) if with_depth else 0, cpu_project.DEPTH_COLUMNS), np.float32)
+        cpu_blend.gather(inverse_depths, order[: len(packed_depths)], packed_depths)
         rows = np.empty((0, 2), np.uint8)
-        return _TileLists(len(means), order, packed, depths, start, entries, slots, first, rows)
+        return _TileLists(count, order, packed, packed_depths, start, entries, slots, first, rows)
 
     @cached_property
     def drawn(self) -> np.ndarray:
@@ -126,7 +133,7 @@ class _TileLists:
             count=self.count,
             order=self.order[kept],
             splats=self.splats[kept],
-            depths=np.empty(0, np.float32),
+            inverse_depths=self.inverse_depths,
             start=listed_before[self.start],
             entries=place[self.entries[listed]],
             slots=shown_before[self.slots[listed]],
@@ -147,6 +154,22 @@ class _TileLists:
         cpu_blend.blend(self.splats, self.start, self.entries, self.rows, self.in_order(values), image, alpha, least)
         return image, alpha
 
+    def blend_with_moments(self, colors: np.ndarray, view: _View) -> tuple[np.ndarray, np.ndarray]:
+        """Blended `colors (n, 3)` and the moments of inverse depth as (5, h, w), and alpha (h, w)."""
+        image = np.empty((cpu_depth.CHANNELS, view.height, view.width), np.float32)
+        alpha = np.empty((view.height, view.width), np.float32)
+        cpu_depth.blend(
+            self.splats, self.start, self.entries, self.in_order(colors), self.inverse_depths,
+            image, alpha, cpu_blend.MIN_TRANSMITTANCE,
+        )  # fmt: skip
+        return image, alpha
+
+    def median_depth(self, view: _View) -> np.ndarray:
+        """(h, w)"""
+        depth = np.empty((view.height, view.width), np.float32)
+        cpu_depth.median_depth(self.splats, self.start, self.entries, self.inverse_depths, depth)
+        return depth
+
     def blend_transpose(self, image: np.ndarray, least: np.float32) -> np.ndarray:
         """For every slot (e, c) the sum over pixels of weight times `image (c, h, w)`."""
         sums = np.empty((len(self.entries), len(image)), np.float32)
@@ -161,45 +184,56 @@ class _TileLists:
 
 
 class _RenderView(torch.autograd.Function):
-    """From raw fields and features to the blended channels (c, h, w) of one view, in the order of `CHANNEL_COUNTS`."""
+    """From raw fields and features to the blended channels (c, h, w) of one view, in the order of `CHANNEL_COUNTS`.
+
+    Also gives alpha (h, w), the median depth (h, w; empty where it is not asked for), and what is visible (n,).
+    """
 
     @staticmethod
     def forward(ctx, view: _View, outputs: frozenset[Output], *fields: Tensor):
         means, log_scales, quaternions, logits, sh, features = (_array(field) for field in fields)
         with KERNEL_LOCK:
-            lists = _TileLists.of(view, means, log_scales, quaternions, logits)
+            lists = _TileLists.of(
+                view, (means, log_scales, quaternions, logits), with_depth=not outputs.isdisjoint(_DEPTHS)
+            )
             columns = []
             if "color" in outputs:
                 columns.append(np.empty((len(means), 3), np.float32))
                 cpu_project.shade(means, sh, lists.drawn, view.numbers, columns[-1])
-            if "depth" in outputs:
-                columns.append(lists.depths[:, None])
             if "normal" in outputs:
                 columns.append(np.empty((len(means), 3), np.float32))
                 cpu_project.normals(means, log_scales, quaternions, lists.drawn, view.numbers, columns[-1])
             values = np.concatenate([*columns, features], 1)
-            image, alpha = lists.blend(values, view, cpu_blend.MIN_TRANSMITTANCE)
+            if "inverse_depth" in outputs:
+                image, alpha = lists.blend_with_moments(values, view)
+            else:
+                image, alpha = lists.blend(values, view, cpu_blend.MIN_TRANSMITTANCE)
+            depth = lists.median_depth(view) if "depth" in outputs else np.empty((0, 0), np.float32)
         ctx.view, ctx.outputs, ctx.lists = view, outputs, lists
         ctx.save_for_backward(*fields)
         ctx.blended = values, image, alpha
-        visible = torch.from_numpy(lists.drawn)
-        ctx.mark_non_differentiable(visible)
-        return torch.from_numpy(image), torch.from_numpy(alpha), visible
+        visible, depth = torch.from_numpy(lists.drawn), torch.from_numpy(depth)
+        ctx.mark_non_differentiable(depth, visible)
+        return torch.from_numpy(image), torch.from_numpy(alpha), depth, visible
 
     @staticmethod
-    def backward(ctx, grad_image, grad_alpha, _grad_visible):
+    def backward(ctx, grad_image, grad_alpha, _grad_depth, _grad_visible):
         means, log_scales, quaternions, logits, sh, _ = (_array(field) for field in ctx.saved_tensors)
         view, lists, (values, image, alpha) = ctx.view, ctx.lists, ctx.blended
         grads = [np.zeros(field.shape, np.float32) for field in ctx.saved_tensors]
         grad_means, grad_log_scales, grad_quaternions, grad_logits, grad_sh, _ = grads
+        # columns of the sums: one for each value, and for inverse depth those of a splat
+        widths = CHANNEL_COUNTS | {"inverse_depth": cpu_project.DEPTH_COLUMNS}
         places, at = {}, cpu_blend.MOMENTS
-        for name, width in CHANNEL_COUNTS.items():
+        for name in CHANNEL_COUNTS:
             if name in ctx.outputs:
-                places[name], at = at, at + width
+                places[name], at = at, at + widths[name]
+        with_moments = (lists.inverse_depths,) if "inverse_depth" in places else ()
+        kernel = cpu_depth.blend_backward if with_moments else cpu_blend.blend_backward
         with KERNEL_LOCK:
-            sums = np.empty((len(lists.entries), cpu_blend.MOMENTS + values.shape[1]), np.float32)
-            cpu_blend.blend_backward(
-                lists.splats, lists.start, lists.entries, lists.slots, lists.in_order(values),
+            sums = np.empty((len(lists.entries), at + ctx.saved_tensors[-1].shape[1]), np.float32)
+            kernel(
+                lists.splats, lists.start, lists.entries, lists.slots, lists.in_order(values), *with_moments,
                 image, alpha, _array(grad_image), _array(grad_alpha), sums, cpu_blend.MIN_TRANSMITTANCE,
             )  # fmt: skip
             totals = lists.sum_slots(sums)
@@ -209,7 +243,7 @@ class _RenderView(torch.autograd.Function):
                 )
             cpu_project.project_backward(
                 means, log_scales, quaternions, logits, lists.drawn, view.numbers, view.antialiased,
-                totals, places.get("depth", 0), places.get("normal", 0),
+                totals, places.get("inverse_depth", 0), places.get("normal", 0),
                 grad_means, grad_log_scales, grad_quaternions, grad_logits,
             )  # fmt: skip
         grads[-1] = totals[:, at:]
@@ -223,7 +257,7 @@ class FrozenView:
         """Project, sort, make tile lists, and drop hidden splats and rows."""
         self._view = _View.of(camera, options)
         with KERNEL_LOCK:
-            lists = _TileLists.of(self._view, *(_array(t) for t in _geometry(gaussians)))
+            lists = _TileLists.of(self._view, [_array(t) for t in _geometry(gaussians)])
             self._lists = lists.without_hidden(self._view, min_row_weight)
         self.visible = torch.from_numpy(self._lists.drawn)
 

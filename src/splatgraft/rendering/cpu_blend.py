@@ -256,7 +256,7 @@ def blend_transpose(splats, start, entries, rows, slots, image, sums, least):
 
 @kernel
 @no_type_check
-def _write_moments(sums, slot, dx, s0, sy, syy):
+def write_moments(sums, slot, dx, s0, sy, syy):
     """Moments of an entry from its sums by column: of the exponent's gradient, times dy, times dy squared."""
     sx = s0 * dx
     sums[slot, 0], sums[slot, 1], sums[slot, 2] = total(s0), total(sx), total(sy)
@@ -265,7 +265,7 @@ def _write_moments(sums, slot, dx, s0, sy, syy):
 
 @kernel
 @no_type_check
-def _exponent_gradient(uncapped, alpha, before, value, left):
+def exponent_gradient(uncapped, alpha, before, value, left):
     """Gradient of the loss by the exponent for a row: 0 where alpha is capped."""
     return where_below(uncapped, MAX_ALPHA, alpha * (before * value - left / (ONE - alpha)))
 
@@ -295,11 +295,11 @@ def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
             left = load(work, at + PIXELS) - weight * value
             store(work, at, before - weight)
             store(work, at + PIXELS, left)
-            pull = _exponent_gradient(uncapped, alpha, before, value, left)
+            pull = exponent_gradient(uncapped, alpha, before, value, left)
             s0, sy, syy = s0 + pull, sy + pull * dy, syy + pull * (dy * dy)
             sum_red, sum_green = sum_red + weight * to_red, sum_green + weight * to_green
             sum_blue = sum_blue + weight * to_blue
-        _write_moments(sums, slot, dx, s0, sy, syy)
+        write_moments(sums, slot, dx, s0, sy, syy)
         sums[slot, MOMENTS] = total(sum_red)
         sums[slot, MOMENTS + 1] = total(sum_green)
         sums[slot, MOMENTS + 2] = total(sum_blue)
@@ -336,14 +336,26 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
             left = load(work, at + PIXELS) - weight * value
             store(work, at, before - weight)
             store(work, at + PIXELS, left)
-            pull = _exponent_gradient(uncapped, alpha, before, value, left)
+            pull = exponent_gradient(uncapped, alpha, before, value, left)
             s0, sy, syy = s0 + pull, sy + pull * dy, syy + pull * (dy * dy)
-        _write_moments(sums, slot, dx, s0, sy, syy)
+        write_moments(sums, slot, dx, s0, sy, syy)
         for channel in range(channels):
             sums[slot, MOMENTS + channel] = total(load(column, channel * TILE))
         if k % BATCH == BATCH - 1 and saturated(work, least):
             return k + 1
     return entries.shape[0]
+
+
+@kernel
+@no_type_check
+def open_rest(image, alpha, grad_image, grad_alpha, x0, y0, work):
+    """Fill plane 1 of the tile with the contribution of what lies behind the first splat: gradient times pixel."""
+    for y in range(y0, min(y0 + TILE, alpha.shape[0])):
+        for x in range(x0, min(x0 + TILE, alpha.shape[1])):
+            rest = grad_alpha[y, x] * alpha[y, x]
+            for c in range(image.shape[0]):
+                rest += grad_image[c, y, x] * image[c, y, x]
+            work[PIXELS + (y - y0) * TILE + x - x0] = rest
 
 
 @kernel(parallel=True)
@@ -357,13 +369,7 @@ def blend_backward(splats, start, entries, slots, values, image, alpha, grad_ima
         read_tile(grad_alpha, x0, y0, work, 2)
         for c in range(channels):
             read_tile(grad_image[c], x0, y0, work, 3 + c)
-        # contribution of what lies behind a splat; before the first splat, gradient times final pixel
-        for y in range(y0, min(y0 + TILE, alpha.shape[0])):
-            for x in range(x0, min(x0 + TILE, alpha.shape[1])):
-                rest = grad_alpha[y, x] * alpha[y, x]
-                for c in range(channels):
-                    rest += grad_image[c, y, x] * image[c, y, x]
-                work[PIXELS + (y - y0) * TILE + x - x0] = rest
+        open_rest(image, alpha, grad_image, grad_alpha, x0, y0, work)
         if channels == RGB:
             used = _backward_rgb(splats, listed, places, values, float32(x0), float32(y0), work, sums, least)
         else:

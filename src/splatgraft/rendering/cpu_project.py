@@ -20,6 +20,9 @@ ZERO, HALF = float32(0), float32(0.5)
 # columns of a splat
 MX, MY, CA, CB, CC, LOG_OPACITY, REACH_X, REACH_Y = range(8)
 COLUMNS = 8
+# columns of a splat's inverse depth: at its centre, its slopes per pixel, its variance along a ray
+AT_CENTER, SLOPE_X, SLOPE_Y, ALONG_RAY = range(4)
+DEPTH_COLUMNS = 4
 
 # places in a camera vector: rotation (9) and translation (3) of camera_from_world, centre (3), then
 FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, NEAR, WIDTH, HEIGHT, LOW_PASS = range(15, 27)
@@ -87,8 +90,12 @@ def _jacobian(x, y, z, camera):
 
 @kernel(parallel=True)
 @no_type_check
-def project(means, log_scales, quaternions, opacity_logits, camera, antialiased, splats, depths):
-    """Fill `splats (n, 8)` and `depths (n,)`; a splat outside the image or too transparent has log opacity -inf."""
+def project(means, log_scales, quaternions, opacity_logits, camera, antialiased, splats, depths, inverse_depths):
+    """Fill `splats (n, 8)` and `depths (n,)`; a splat outside the image or too transparent has log opacity -inf.
+
+    Fill `inverse_depths (n, 4)` unless it is empty: the Gaussian's 1 / z given the pixel, which is linear in the pixel
+    because screen position and 1 / z of a plane are (as in RaDe-GS, Zhang et al. 2024), and its variance.
+    """
     n, low = means.shape[0], camera[LOW_PASS]
     for block in prange((n + BLOCK - 1) // BLOCK):
         rotation, axes, offset = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
@@ -125,6 +132,17 @@ def project(means, log_scales, quaternions, opacity_logits, camera, antialiased,
             splats[g, REACH_X] = reach_x
             splats[g, REACH_Y] = reach_y
             depths[g] = z
+            if inverse_depths.shape[0] > 0:
+                cross_x, cross_y, own = 0.0, 0.0, 0.0
+                for j in range(3):
+                    h0, h1 = j00 * axes[0, j] + j02 * axes[2, j], j11 * axes[1, j] + j12 * axes[2, j]
+                    k = -axes[2, j] / (z * z)
+                    cross_x, cross_y, own = cross_x + k * h0, cross_y + k * h1, own + k * k
+                slope_x = ((yy + low) * cross_x - xy * cross_y) / determinant
+                slope_y = ((xx + low) * cross_y - xy * cross_x) / determinant
+                inverse_depths[g, AT_CENTER] = 1 / z
+                inverse_depths[g, SLOPE_X], inverse_depths[g, SLOPE_Y] = slope_x, slope_y
+                inverse_depths[g, ALONG_RAY] = own - slope_x * cross_x - slope_y * cross_y
 
 
 @kernel(parallel=True)
@@ -222,7 +240,8 @@ def project_backward(
     """Add the gradients of `project`, given those of the splats, to the gradients of the raw fields.
 
     `totals (n, ..)`: first sums over pixels of dL/d(exponent) times 1, dx, dy, dx^2, dx dy, dy^2, with d from centre
-    to pixel; gradients of depth and of the normal from columns `depth_at` and `normal_at`, unless 0.
+    to pixel; gradients of the four columns of inverse depth and of the normal from columns `depth_at` and `normal_at`,
+    unless 0.
     """
     n, low = means.shape[0], camera[LOW_PASS]
     for block in prange((n + BLOCK - 1) // BLOCK):
@@ -259,25 +278,47 @@ def project_backward(
                 d_yy += to_sharp * xx + to_blurred * (xx + low)
                 d_xy -= 2 * xy * (to_sharp + to_blurred)
 
-            d00, d02, d11, d12 = 0.0, 0.0, 0.0, 0.0
+            # gradients by the covariances of 1 / z with the pixel, and twice that by its variance
+            d_cross_x, d_cross_y, d_own, d_inverse_depth = 0.0, 0.0, 0.0, 0.0
+            if depth_at > 0 and free_x and free_y:
+                cross_x, cross_y = 0.0, 0.0
+                for j in range(3):
+                    h0, h1 = j00 * axes[0, j] + j02 * axes[2, j], j11 * axes[1, j] + j12 * axes[2, j]
+                    k = -axes[2, j] / (z * z)
+                    cross_x, cross_y = cross_x + k * h0, cross_y + k * h1
+                slope_x, slope_y = a * cross_x + b * cross_y, b * cross_x + c * cross_y
+                d_inverse_depth = float(totals[g, depth_at + AT_CENTER])
+                d_slope_x, d_slope_y = float(totals[g, depth_at + SLOPE_X]), float(totals[g, depth_at + SLOPE_Y])
+                d_along = float(totals[g, depth_at + ALONG_RAY])
+                d_mx, d_my = d_mx - slope_x * d_inverse_depth, d_my - slope_y * d_inverse_depth
+                to_x, to_y = a * d_slope_x + b * d_slope_y, b * d_slope_x + c * d_slope_y
+                d_cross_x, d_cross_y = to_x - 2 * slope_x * d_along, to_y - 2 * slope_y * d_along
+                d_own = 2 * d_along
+                d_xx += d_along * slope_x * slope_x - to_x * slope_x
+                d_yy += d_along * slope_y * slope_y - to_y * slope_y
+                d_xy += 2 * d_along * slope_x * slope_y - to_x * slope_y - to_y * slope_x
+
+            d00, d02, d11, d12, d_z = 0.0, 0.0, 0.0, 0.0, -d_inverse_depth / (z * z)
             for j in range(3):
                 h0, h1 = j00 * axes[0, j] + j02 * axes[2, j], j11 * axes[1, j] + j12 * axes[2, j]
-                d_h0, d_h1 = 2 * d_xx * h0 + d_xy * h1, 2 * d_yy * h1 + d_xy * h0
+                k = -axes[2, j] / (z * z)
+                d_h0 = 2 * d_xx * h0 + d_xy * h1 + d_cross_x * k
+                d_h1 = 2 * d_yy * h1 + d_xy * h0 + d_cross_y * k
+                d_k = d_cross_x * h0 + d_cross_y * h1 + d_own * k
                 d00, d02 = d00 + d_h0 * axes[0, j], d02 + d_h0 * axes[2, j]
                 d11, d12 = d11 + d_h1 * axes[1, j], d12 + d_h1 * axes[2, j]
                 d_axes[0, j], d_axes[1, j] = j00 * d_h0, j11 * d_h1
-                d_axes[2, j] = j02 * d_h0 + j12 * d_h1
+                d_axes[2, j] = j02 * d_h0 + j12 * d_h1 - d_k / (z * z)
+                d_z -= 2 * d_k * k / z
 
             dx, dy = camera[FX] / z * d_mx, camera[FY] / z * d_my
-            dz = -(dx * x + dy * y) / z - (d00 * j00 + d02 * j02 + d11 * j11 + d12 * j12) / z
+            dz = d_z - (dx * x + dy * y) / z - (d00 * j00 + d02 * j02 + d11 * j11 + d12 * j12) / z
             if free_x:
                 d_u = -j00 * d02
                 dx, dz = dx + d_u / z, dz - d_u * x / (z * z)
             if free_y:
                 d_v = -j11 * d12
                 dy, dz = dy + d_v / z, dz - d_v * y / (z * z)
-            if depth_at > 0:
-                dz += totals[g, depth_at]
             for i in range(3):
                 grad_means[g, i] += camera[i] * dx + camera[3 + i] * dy + camera[6 + i] * dz
 

@@ -1,4 +1,4 @@
-"""Rendering on CUDA by gsplat's `rasterization`."""
+"""Rendering on CUDA by gsplat's `rasterization`; median depth, which it does not have, by the CPU's kernels."""
 
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
@@ -11,6 +11,7 @@ from torch import Tensor
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.rendering import cpu
 from splatgraft.rendering.interface import Output, Render, RenderOptions, assemble_render
 
 
@@ -26,12 +27,76 @@ def render(
 
     Raises: ValueError where gsplat is not installed.
     """
-    views = [_channels(gaussians, camera, outputs, features) for camera in cameras]
-    drawn = [_draw(gaussians, camera, values, options) for camera, values in zip(cameras, views, strict=True)]
-    image, alpha, visible = (torch.stack(parts) for parts in zip(*drawn, strict=True))
-    return assemble_render(
-        image.permute(0, 3, 1, 2), alpha, visible, outputs=outputs, has_features=features is not None, options=options
-    )
+    drawn = []
+    for camera in cameras:
+        image, alpha, visible = _draw(gaussians, camera, _channels(gaussians, camera, outputs, features), options)
+        if "inverse_depth" in outputs:
+            planes = _draw(gaussians, camera, moment_channels(gaussians, camera, options), options)[0]
+            image = torch.cat([image, moments(planes, camera)], -1)
+        drawn.append((image.permute(2, 0, 1), alpha, _median_depth(gaussians, camera, outputs, options), visible))
+    image, alpha, depth, visible = (torch.stack(parts) for parts in zip(*drawn, strict=True))
+    return assemble_render(image, alpha, depth, visible, outputs=outputs, options=options)
+
+
+def _median_depth(
+    gaussians: Gaussians, camera: Cameras, outputs: AbstractSet[Output], options: RenderOptions
+) -> Float[Tensor, "h w"]:
+    """Median depth by the CPU's kernels, because gsplat has none for 3D Gaussians; empty where it is not asked for."""
+    if "depth" not in outputs:
+        return gaussians.means.new_zeros(0, 0)
+    on_cpu = gaussians.map(lambda tensor: tensor.detach().cpu())
+    drawn = cpu.render(on_cpu, camera.to("cpu"), outputs=frozenset({"depth"}), features=None, options=options)
+    return drawn.depth[0].to(gaussians.device)
+
+
+def inverse_depth_planes(
+    gaussians: Gaussians, camera: Cameras, options: RenderOptions
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    """Mean of each Gaussian's inverse depth as a linear function of the pixel, and its variance given the pixel.
+
+    `cpu_project.project` computes the same.
+
+    Returns:
+        Coefficients of 1, (x - cx) / fx and (y - cy) / fy, per world unit; variances, per world unit squared.
+    """
+    pose, k = camera.camera_from_world[0].to(gaussians.means), camera.intrinsics[0].to(gaussians.means)
+    in_camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
+    z = in_camera[:, 2].clamp_min(options.near)
+    center, focal = in_camera[:, :2] / z[:, None], torch.stack([k[0, 0], k[1, 1]])
+    size, principal = camera.sizes[0].to(z), k[:2, 2]
+    low, high = -principal / focal - 0.15 * size / focal, (size - principal) / focal + 0.15 * size / focal
+    held = torch.maximum(torch.minimum(center, high), low)
+    zero = torch.zeros_like(z)
+    rows = [
+        torch.stack([1 / z, zero, -held[:, 0] / z], -1),
+        torch.stack([zero, 1 / z, -held[:, 1] / z], -1),
+        torch.stack([zero, zero, -1 / z.square()], -1),
+    ]
+    axes = torch.stack(rows, 1) @ pose[:3, :3] @ (gaussians.rotations * gaussians.scales[:, None])
+    covariance = axes @ axes.mT
+    blurred = covariance[:, :2, :2] + torch.diag(options.low_pass_px2 / focal.square())
+    slope = torch.linalg.solve(blurred, covariance[:, :2, 2])
+    variance = covariance[:, 2, 2] - (slope * covariance[:, :2, 2]).sum(1)
+    at_axis = 1 / z - (slope * center).sum(1)
+    return torch.cat([at_axis[:, None], slope], 1), variance
+
+
+def moment_channels(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> Float[Tensor, "n 9"]:
+    """Values whose blended sums give both moments: c = a + b x + d y, and the products of a, b, d for c^2 + v."""
+    planes, variance = inverse_depth_planes(gaussians, camera, options)
+    a, b, d = planes.unbind(1)
+    return torch.cat([planes, torch.stack([a * a + variance, a * b, a * d, b * b, b * d, d * d], 1)], 1)
+
+
+def moments(sums: Float[Tensor, "h w 9"], camera: Cameras) -> Float[Tensor, "h w 2"]:
+    """Moments of inverse depth from the blended channels of `moment_channels`."""
+    k = camera.intrinsics[0].to(sums)
+    x = ((torch.arange(camera.width).to(sums) + 0.5 - k[0, 2]) / k[0, 0])[None]
+    y = ((torch.arange(camera.height).to(sums) + 0.5 - k[1, 2]) / k[1, 1])[:, None]
+    a, b, d, aa, ab, ad, bb, bd, dd = sums.unbind(-1)
+    first = a + b * x + d * y
+    second = aa + 2 * (ab * x + ad * y + bd * x * y) + bb * x.square() + dd * y.square()
+    return torch.stack([first, second], -1)
 
 
 class FrozenView:
@@ -107,9 +172,6 @@ def _channels(
     if "color" in outputs:
         directions = torch.nn.functional.normalize(offset, dim=-1)
         parts.append(spherical_harmonics.colors(gaussians.sh, directions))
-    if "depth" in outputs:
-        forward = camera.world_from_camera[0, :3, 2].to(gaussians.means)
-        parts.append((offset @ forward)[:, None])
     if "normal" in outputs:
         axes = gaussians.log_scales.detach().argmin(-1)
         normal = gaussians.rotations[torch.arange(gaussians.count, device=axes.device), :, axes]

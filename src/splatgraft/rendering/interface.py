@@ -14,9 +14,9 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 
-Output = Literal["color", "depth", "normal"]
-CHANNEL_COUNTS: dict[Output, int] = {"color": 3, "depth": 1, "normal": 3}
-"""Number of channels of each output, blended in this order; features follow."""
+Output = Literal["color", "depth", "inverse_depth", "normal"]
+CHANNEL_COUNTS: dict[Output, int] = {"color": 3, "inverse_depth": 2, "normal": 3}
+"""Number of channels of each blended output, in this order; features follow. Depth is not blended."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,15 @@ class Render:
 
     @property
     def depth(self) -> Float[Tensor, "v h w"]:
-        """Expected distance along the optical axis given a hit, world units; 0 where alpha is 0."""
+        """Median depth: distance along the optical axis at which the transmittance falls below one half, world units; 0
+        where it never does. It has no gradient."""
         return self._asked("depth")
+
+    @property
+    def inverse_depth(self) -> Float[Tensor, "v h w 2"]:
+        """First and second moment of inverse depth along each ray, not divided by alpha: sums of w c and of w (c^2 + v)
+        over Gaussians with blending weight w, mean c and variance v given the pixel; per world unit, and its square."""
+        return self._asked("inverse_depth")
 
     @property
     def normal(self) -> Float[Tensor, "v h w 3"]:
@@ -115,7 +122,7 @@ def render(
     Args:
         gaussians: n Gaussians, on the CPU (numba) or a CUDA device (gsplat).
         cameras: v cameras that share one image size.
-        outputs: Which of color, depth and normal to render.
+        outputs: Which of color, depth, inverse_depth and normal to render; inverse_depth goes with color alone.
         features: f values per Gaussian that are blended like colours.
         options: Low-pass filter, near plane and background.
 
@@ -123,8 +130,13 @@ def render(
         The pictures that were asked for, with opacity and visibility, on the device of `gaussians`.
 
     Raises:
-        ValueError: The cameras' image sizes differ, or gsplat is not installed.
+        ValueError: The cameras' image sizes differ, gsplat is not installed, or inverse_depth is asked for with
+            normals or features.
     """
+    if "inverse_depth" in outputs and (features is not None or not outputs <= {"color", "depth", "inverse_depth"}):
+        raise ValueError("render: expected inverse_depth with color and depth alone, found normal or features")
+    if "inverse_depth" in outputs:
+        outputs = outputs | {"color"}  # they are blended in one pass
     implementation = _implementation(gaussians)
     _ = cameras.width  # refuses what cannot be stacked
     return implementation.render(gaussians, cameras, outputs=outputs, features=features, options=options)
@@ -153,11 +165,10 @@ def surface_points(scene: Gaussians, camera: Cameras, pixels: Float[Tensor, "k 2
     size = camera.sizes[0].to(pixels)
     pixels = torch.minimum(pixels.clamp_min(0), size - 1)
     column, row = pixels.long().unbind(-1)
-    solid = drawn.alpha[0][row, column] > 0.5
     depth = drawn.depth[0][row, column]
     rays = torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1) @ torch.linalg.inv(camera.intrinsics[0].to(pixels)).T
     pose = camera.world_from_camera[0].to(pixels)
-    return ((rays * depth[:, None]) @ pose[:3, :3].T + pose[:3, 3])[solid].detach()
+    return ((rays * depth[:, None]) @ pose[:3, :3].T + pose[:3, 3])[depth > 0]
 
 
 def _implementation(gaussians: Gaussians) -> ModuleType:
@@ -169,10 +180,10 @@ def _implementation(gaussians: Gaussians) -> ModuleType:
 def assemble_render(
     image: Float[Tensor, "v c h w"],
     alpha: Float[Tensor, "v h w"],
+    depth: Float[Tensor, "v h w"],
     visible: Bool[Tensor, "v n"],
     *,
     outputs: AbstractSet[Output],
-    has_features: bool,
     options: RenderOptions,
 ) -> Render:
     """Split channels, blended over black in the order of `CHANNEL_COUNTS` and then features, into a `Render`."""
@@ -187,11 +198,13 @@ def assemble_render(
             color = color + (1 - alpha)[:, None] * color.new_tensor(options.background)[:, None, None]
         made["color"] = color.permute(0, 2, 3, 1)
     if "depth" in outputs:
-        made["depth"] = planes["depth"][:, 0] / torch.where(alpha > 0, alpha, 1)
+        made["depth"] = depth
+    if "inverse_depth" in outputs:
+        made["inverse_depth"] = planes["inverse_depth"].permute(0, 2, 3, 1)
     if "normal" in outputs:
         normal = planes["normal"].permute(0, 2, 3, 1)
         squares = (normal * normal).sum(-1, keepdim=True)
         made["normal"] = normal / torch.where(squares > 0, squares, 1).sqrt()
-    if has_features:
+    if image.shape[1] > at:
         made["features"] = image[:, at:].permute(0, 2, 3, 1)
     return Render(alpha=alpha, visible=visible, pictures=made)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from splatgraft.composition import Placed, PlaceOptions, place_object
+from splatgraft.composition import NoFreePlaceError, Placed, PlaceOptions, place_object
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_image
 from splatgraft.folders.capture_files import camera_files
@@ -56,7 +56,8 @@ class Compose:
         return scenes | {"cameras": (*cameras, *surroundings, *scales)}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Compose and write the scene."""
+        """Compose and write the scene; where there is no room, a picture of the free places beside the folder."""
+        self._free_places.unlink(missing_ok=True)
         target, object_ = read_gaussians(self.target), read_gaussians(self.object)
         placement = (
             self._found(target, object_, folder, context) if self.placement is None else read_placement(self.placement)
@@ -64,6 +65,11 @@ class Compose:
         named = tuple(replace(item, object_path=item.object_path or self.object) for item in placement.objects)
         placement = replace(placement, objects=named)
         write_composite(folder, composite_of(target, placement, known={self.object: object_}), placement)
+
+    @property
+    def _free_places(self) -> Path:
+        """Picture beside the result's folder, which a step that fails leaves as it was."""
+        return self.out.with_name(f"{self.out.name}_free_places.png")
 
     def _found(self, target: Gaussians, object_: Gaussians, folder: Path, context: Context) -> Placement:
         """The placement on a level surface of the target."""
@@ -82,7 +88,12 @@ class Compose:
         in_metres = [read_scale(path) for path in (self.object_cameras, self.cameras)]
         if options.scale is None and (own := in_metres[0]) is not None and (place := in_metres[1]) is not None:
             options = replace(options, scale=own.metres_per_unit / place.metres_per_unit)
-        placed = place_object(target, object_, cameras=cameras, surroundings=surroundings, options=options)
+        try:
+            placed = place_object(target, object_, cameras=cameras, surroundings=surroundings, options=options)
+        except NoFreePlaceError as error:
+            write_image(self._free_places, error.picture)
+            shown = f"{self._free_places} shows free places green and what stands there red"
+            raise ValueError(f"{error}; {shown}") from error
         where = ", ".join(f"{x:.3f}" for x in placed.support.point.tolist())
         context.console.say(f"placed at ({where}), scale {placed.target_from_object.scale:.3f}")
         context.console.say(_size(placed, self.options.scale, in_metres[0], in_metres[1]))

@@ -9,7 +9,9 @@ from typing import Any
 
 import torch
 
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.evaluation import (
     ComparedView,
@@ -19,8 +21,11 @@ from splatgraft.evaluation import (
     StepTime,
     TurntableOptions,
     change_map,
+    depth_colors,
     describe_change,
     measure,
+    normal_colors,
+    normals_from_depth,
     side_by_side,
     turntable_cameras,
     write_animation,
@@ -32,6 +37,7 @@ from splatgraft.folders.evaluated_scenes import EvaluatedScenes, Pictures, TrueV
 from splatgraft.project.layout import RESULTS_IN_ORDER, SCENE_FILE
 from splatgraft.project.record import Record, read_record
 from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
+from splatgraft.rendering import render
 from splatgraft.runtime.note import Note
 
 
@@ -96,11 +102,13 @@ class Evaluate:
             truth = TrueViews.read(self.ground_truth, self.target_capture, self.views)
             metrics, missing = self._measure(truth.compared(scenes), context)
         if truth is not None:
+            cameras = truth.truth.cameras
             pictures = [truth.pictures(scenes, index) for index in _spread(len(truth.truth), self.pictured)]
         else:
             sized = scenes.with_width(self.width)
-            chosen = dict.fromkeys([sized.best_view, *_spread(len(sized.cameras), self.pictured)])
-            pictures = [sized.pictures_from(sized.cameras[i]) for i in list(chosen)[: self.pictured]]
+            cameras = sized.cameras
+            chosen = dict.fromkeys([sized.best_view, *_spread(len(cameras), self.pictured)])
+            pictures = [sized.pictures_from(cameras[i]) for i in list(chosen)[: self.pictured]]
         changes = [describe_change(p.result, p.copy_paste, p.mask) for p in pictures]
         best = max(pictures, key=lambda p: p.prominence)
         # the page begins with it
@@ -121,7 +129,14 @@ class Evaluate:
             machine=f"{os.cpu_count()} cores of {platform.machine()}, {device}",
             limits=_LIMITS if truth is None else (),
         )
-        write_report(folder, report, views=(_report_view(p) for p in pictures), turntable=turntable)
+        most_prominent = sorted(pictures, key=lambda p: -p.prominence)[:_GEOMETRY_VIEWS]
+        write_report(
+            folder,
+            report,
+            views=(_report_view(p) for p in pictures),
+            geometry=(_geometry_view(scenes.result, cameras[cameras.names.index(p.name)], p) for p in most_prominent),
+            turntable=turntable,
+        )
 
     def _measure(self, views: Sequence[ComparedView], context: Context) -> tuple[dict, dict[str, str]]:
         try:
@@ -142,6 +157,8 @@ class Evaluate:
 
 _WARNING_PX = 640
 """Width of the pictures beside warnings: twice that at which the page shows them."""
+_GEOMETRY_VIEWS = 2  # those that show the object best
+_GEOMETRY_PX = 640  # longest side: twice that at which the page shows them
 _LIMITS = (
     "There is no ground truth for these captures: the pictures show what was done, not how right it is.",
     "Viewpoints far from the captured ones show less than the captured ones do.",
@@ -158,6 +175,19 @@ def _report_view(pictures: Pictures) -> ReportView:
     if pictures.truth is not None:
         shown["Ground truth"] = pictures.truth
     shown |= {"Before": pictures.before, "Change of light": change_map(pictures.result, pictures.copy_paste)}
+    return ReportView(name=pictures.name, held_out=pictures.held_out, pictures=shown)
+
+
+def _geometry_view(scene: Gaussians, camera: Cameras, pictures: Pictures) -> ReportView:
+    """Draw the surface of the final scene from the camera of one view."""
+    small = camera.limited(_GEOMETRY_PX)
+    drawn = render(scene, small.to(scene.device), outputs=frozenset({"color", "depth"}))
+    depth = drawn.depth[0].cpu()
+    shown = {
+        "Result": drawn.color[0].cpu(),
+        "Depth": depth_colors(depth),
+        "Normals": normal_colors(normals_from_depth(depth, small)),
+    }
     return ReportView(name=pictures.name, held_out=pictures.held_out, pictures=shown)
 
 

@@ -176,7 +176,8 @@ def render_panorama(
     distance = None
     if with_distance:
         # depth runs along each face's axis, which is a direction's largest component
-        distance = rendered.depth.detach() / directions.abs().max(-1).values.to(alpha)
+        depth = torch.where(rendered.depth > 0, rendered.depth, torch.inf)
+        distance = depth / directions.abs().max(-1).values.to(alpha)
     return Panorama(
         radiance=linear_from_srgb(color) * visible[..., None],
         alpha=alpha * visible,
