@@ -119,20 +119,27 @@ def compare(scene: Gaussians, photos: PosedImages) -> str:
     )
 
 
+_BACKGROUNDS = {"grey": (0.5, 0.5, 0.5), "black": (0.0, 0.0, 0.0), "magenta": (1.0, 0.0, 1.0)}
+"""sRGB behind an object; what is see-through differs over them."""
+
+
 def compare_object(found: Gaussians, photos: PosedImages) -> str:
-    """The part of the line that says how close the object comes to the photos inside its masks, over grey."""
+    """The part of the line that says how close the object comes to the photos inside its masks, by background."""
     rows: list[tuple[float, ...]] = []
     for i in range(len(photos)):
         mask = photos.mask(i)
         if mask is None or not bool((mask > 0.5).any()):
             continue
-        drawn = render(found, photos.cameras[i], options=RenderOptions(background=(0.5, 0.5, 0.5)))
-        picture, truth = (image[mask > 0.5][None] for image in (drawn.color[0].clamp(0, 1), photos.image(i)))
-        overlap = torch.minimum(drawn.alpha[0], mask).sum() / torch.maximum(drawn.alpha[0], mask).sum()
-        found_here = (psnr(picture, truth), psnr(fit_color(picture, truth), truth), overlap)
-        rows.append(tuple(float(value) for value in found_here))
-    decibel, of_fitted, overlap = (sum(column) / len(rows) for column in zip(*rows, strict=True))
-    return f"views={len(rows)} psnr={decibel:.2f} psnr_fit={of_fitted:.2f} overlap={overlap:.3f}"
+        truth = photos.image(i)[mask > 0.5][None]
+        drawn = [render(found, photos.cameras[i], options=RenderOptions(background=b)) for b in _BACKGROUNDS.values()]
+        pictures = [one.color[0].clamp(0, 1)[mask > 0.5][None] for one in drawn]
+        alpha = drawn[0].alpha[0]
+        overlap = torch.minimum(alpha, mask).sum() / torch.maximum(alpha, mask).sum()
+        fitted = [psnr(fit_color(picture, truth), truth) for picture in pictures]
+        rows.append(tuple(float(value) for value in (psnr(pictures[0], truth), *fitted, overlap)))
+    decibel, *of_fitted, overlap = (sum(column) / len(rows) for column in zip(*rows, strict=True))
+    over = " ".join(f"psnr_over_{name}={x:.2f}" for name, x in list(zip(_BACKGROUNDS, of_fitted, strict=True))[1:])
+    return f"views={len(rows)} psnr={decibel:.2f} psnr_fit={of_fitted[0]:.2f} {over} overlap={overlap:.3f}"
 
 
 def main() -> int:

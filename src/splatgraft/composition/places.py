@@ -91,10 +91,16 @@ class Suggestion:
 class NoFreePlaceError(ValueError):
     """No place on the support has room for the object at half of the guessed size."""
 
-    def __init__(self, text: str, picture: Float[Tensor, "h w 3"]) -> None:
-        """Make the error of a sentence and a view of the target: free places green, what stands beside them red."""
+    def __init__(self, text: str, picture: Float[Tensor, "h w 3"], scale: float) -> None:
+        """Make the error.
+
+        Args:
+            text: One sentence.
+            picture: A view of the target: free places green, what stands beside them red.
+            scale: Half of the guess, at which a caller may place the object by hand.
+        """
         super().__init__(text)
-        self.picture = picture
+        self.picture, self.scale = picture, scale
 
 
 @dataclass(frozen=True)
@@ -181,6 +187,7 @@ def suggest_places(
             "placement: expected a free place beside what the cameras look at, for the object at half of its guessed "
             f"size or more, found {room}; name a place (--at or --on) or a size (--scale)",
             _picture(target, ground, cameras=cameras),
+            _MIN_SIZE * guess,
         )
     if fit is not None:
         score = fit.score * (fit.free & level)

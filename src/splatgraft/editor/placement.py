@@ -3,13 +3,14 @@
 import math
 import warnings
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from splatgraft.composition import ObjectBase, Placed, PlaceOptions, place_object, rest_on_surface
+from splatgraft.composition import NoFreePlaceError, ObjectBase, Placed, PlaceOptions, place_object, rest_on_surface
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
@@ -120,9 +121,16 @@ class PlaceableObject:
 def suggest_placement(
     target: Gaussians, item: PlaceableObject, cameras: Cameras, options: PlaceOptions = PlaceOptions()
 ) -> Placed:
-    """A visible, level place at a plausible size, found as by `compose` with `options`; ValueError where is none."""
+    """Suggest a place as `compose` does, and half of the guessed size where no place is free: it can be dragged.
+
+    ValueError where there is no surface.
+    """
     both = (cameras, item.cameras)
-    return place_object(target, item.gaussians, cameras=both, surroundings=item.surroundings, options=options)
+    place = partial(place_object, target, item.gaussians, cameras=both, surroundings=item.surroundings)
+    try:
+        return place(options=options)
+    except NoFreePlaceError as error:
+        return place(options=replace(options, scale=error.scale))
 
 
 def drop_to_surface(

@@ -29,9 +29,9 @@ class SurfaceLoss:
 
     unit: float
     """Length in which depth is measured, world units: the distance of what the cameras look at."""
-    spread: float = 5.0
+    spread: float = 0.3
     """Factor on the spread."""
-    bend: float = 1.0
+    bend: float = 0.3
     """Factor on the bend."""
     spread_from: float = 0.5
     """Share of the steps after which the spread counts. Earlier it holds what is far at the nearest surface's edge."""

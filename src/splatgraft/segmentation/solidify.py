@@ -20,6 +20,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting.density import DensityControl
 from splatgraft.fitting.gaussian_fit import FitOptions, LearningRates, View, fit
+from splatgraft.fitting.surface_loss import SurfaceLoss
 from splatgraft.rendering import RenderOptions, render, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
@@ -106,8 +107,7 @@ def solidify_object(
         progress: Called with steps done, steps in all and a short text.
 
     Returns:
-        The object's Gaussians, changed in every field, and more of them where the photographs show it larger than they
-        are many.
+        The object's Gaussians, changed in every field; densified where the images hold more detail than the Gaussians.
 
     Raises:
         ValueError: No mask shows any of it.
@@ -121,6 +121,7 @@ def solidify_object(
     if not views:
         raise ValueError("object: expected a mask with some of it inside, found all empty")
     radius = float((chosen.means - chosen.means.mean(0)).norm(dim=1).quantile(0.9))
+    away = float((cameras.centers - chosen.means.mean(0)).norm(dim=1).median())
     rates = replace(
         _RATES,
         means=radius * _RATES.means,
@@ -130,7 +131,14 @@ def solidify_object(
     fitted = fit(
         chosen,
         _ObjectViews(views),
-        FitOptions(options.iterations, rates, background=None, view_gains=gains, seed=options.seed),
+        FitOptions(
+            options.iterations,
+            rates,
+            background=None,
+            view_gains=gains,
+            surfaces=SurfaceLoss(unit=away),
+            seed=options.seed,
+        ),
         control=None if options.pixels_per_gaussian == 0 else _density(chosen, views, cameras, options).update,
         progress=lambda done, total, text: progress(done, total, f"making the object solid, {text}"),
     )
