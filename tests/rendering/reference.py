@@ -64,7 +64,11 @@ def inverse_depths(
     slope = torch.einsum("nij,nj->ni", torch.linalg.inv(blurred), covariance[:, :2, 2])
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     away = torch.stack([x, y], -1)[:, :, None].to(center) - center
-    return 1 / depth + (away * slope).sum(-1), covariance[:, 2, 2] - (slope * covariance[:, :2, 2]).sum(1)
+    mean, variance = 1 / depth + (away * slope).sum(-1), covariance[:, 2, 2] - (slope * covariance[:, :2, 2]).sum(1)
+    # no gradient where the centre is out of view: the plane is extrapolated there
+    size = camera.sizes[0].to(center)
+    shown = ((center > -0.15 * size) & (center < 1.15 * size)).all(1)
+    return torch.where(shown, mean, mean.detach()), torch.where(shown, variance, variance.detach())
 
 
 def weights(
@@ -103,7 +107,9 @@ def render(
     alpha = weight.sum(-1)
     blended_normal = weight @ normal[order]
     covered = weight.cumsum(-1)
-    middle = inverse.gather(-1, (covered > 0.5).int().argmax(-1, keepdim=True))[..., 0]
+    at_center = 1 / projection(gaussians, camera, options)[3][order]
+    bounded = torch.minimum(torch.maximum(inverse, at_center / 4), 4 * at_center)
+    middle = bounded.gather(-1, (covered > 0.5).int().argmax(-1, keepdim=True))[..., 0]
     background = torch.tensor(options.background).to(alpha)
     visible = torch.zeros(gaussians.count, dtype=torch.bool)
     visible[order] = (weight > 0).any(0).any(0)
@@ -112,7 +118,7 @@ def render(
         visible=visible[None],
         pictures={
             "color": (weight @ colors[order] + (1 - alpha)[..., None] * background)[None],
-            "depth": torch.where((covered[..., -1] > 0.5) & (middle > 0), 1 / middle, 0)[None].detach(),
+            "depth": torch.where(covered[..., -1] > 0.5, 1 / middle, 0)[None].detach(),
             "inverse_depth": torch.stack(
                 [(weight * inverse).sum(-1), (weight * (inverse.square() + variance)).sum(-1)], -1
             )[None],

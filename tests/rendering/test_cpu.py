@@ -128,6 +128,26 @@ def test_a_flat_gaussian_has_the_depth_of_its_plane():
     assert spread[shown].abs().max() < 1e-5
 
 
+def test_every_pixel_with_more_than_half_opacity_has_a_depth():
+    # a floor seen from just above: the rims of its wide splats reach above the horizon
+    floor = Gaussians(
+        means=torch.cartesian_prod(torch.linspace(-3, 3, 7), torch.tensor([0.3]), torch.linspace(0.5, 6, 7)),
+        log_scales=torch.tensor([[0.8, 0.001, 0.8]]).log().repeat(49, 1),
+        quaternions=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(49, 1),
+        opacity_logits=torch.full((49,), 4.0),
+        sh=torch.zeros(49, 1, 3),
+    )
+    drawn = rendering.render(floor, camera_at_origin(), outputs=frozenset({"depth"}))
+    shown = drawn.alpha > 0.5 + 1e-4
+    assert shown[0, 14].any()
+    assert (drawn.depth[shown] > 0).all()
+
+
+def camera_at_origin() -> Cameras:
+    intrinsics = torch.tensor([[[20.0, 0.0, 20.0], [0.0, 20.0, 15.0], [0.0, 0.0, 1.0]]])
+    return Cameras(torch.eye(4)[None], intrinsics, torch.tensor([[40, 30]]), ("a",))
+
+
 def test_inverse_depth_is_not_drawn_with_normals():
     with pytest.raises(ValueError, match="expected inverse_depth with color and depth alone"):
         rendering.render(random_scene(3, 0, seed=0), camera(), outputs=frozenset({"inverse_depth", "normal"}))

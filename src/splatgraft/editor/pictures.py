@@ -160,11 +160,12 @@ class Pictures:
 
 def with_object(background: Picture, object_: Gaussians, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
     """A picture with an object in front of what is farther away in it."""
-    found = render(object_, camera, outputs=frozenset({"color", "depth"}))
+    found = render(object_, camera, outputs=frozenset({"color", "inverse_depth"}))
     alpha = found.alpha[0].numpy()
     if background.depth is not None:
-        # half an opaque pixel's depth is that of the object itself
-        alpha = np.where(found.depth[0].numpy() < background.depth, alpha, 0)
+        # the mean of inverse depth: faint pixels of the outline have no median depth
+        is_nearer = found.inverse_depth[0, ..., 0].numpy() * background.depth > alpha
+        alpha = np.where(is_nearer, alpha, 0)
     color = found.color[0].clamp(0, 1).numpy()
     share = np.where(alpha > 0, 1 - alpha, 1)[..., None]
     out = background.pixels * share + 255 * np.where(alpha[..., None] > 0, color, 0)

@@ -31,6 +31,7 @@ from splatgraft.rendering.cpu_project import ALONG_RAY, AT_CENTER, SLOPE_X, SLOP
 from splatgraft.rendering.cpu_simd import (
     broadcast,
     lanes,
+    larger,
     load,
     smaller,
     store,
@@ -43,7 +44,8 @@ from splatgraft.runtime.kernels import kernel
 
 CHANNELS = 5
 """Red, green, blue, and the two moments of inverse depth."""
-_TWO = float32(2)
+_LEAST, _MOST = float32(1 / 4), float32(4)
+"""Bounds on inverse depth over that at the centre: the faint rim of a wide splat reaches beyond its plane's horizon."""
 
 
 @kernel(parallel=True)
@@ -57,15 +59,16 @@ def median_depth(splats, start, entries, inverse_depths, depth):
             mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, float32(x0), float32(y0))
             dx = lanes() - mx
             across = dx * dx * a + d
-            plane_x = inverse_depths[s, AT_CENTER] + dx * inverse_depths[s, SLOPE_X]
-            slope_y = inverse_depths[s, SLOPE_Y]
+            center, slope_y = inverse_depths[s, AT_CENTER], inverse_depths[s, SLOPE_Y]
+            plane_x, least = center + dx * inverse_depths[s, SLOPE_X], broadcast(_LEAST * center)
             for y in range(top, bottom):
                 dy = float32(y) - my
                 at = y * TILE
                 before = load(work, at)
                 after = before - smaller(alpha_row(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
                 store(work, at, after)
-                crossing = where_below(after, HALF, where_at_least(before, HALF, plane_x + slope_y * dy))
+                inverse = larger(smaller(plane_x + slope_y * dy, _MOST * center), least)
+                crossing = where_below(after, HALF, where_at_least(before, HALF, inverse))
                 store(work, at + PIXELS, load(work, at + PIXELS) + crossing)
             if (k - start[tile]) % BATCH == BATCH - 1 and saturated(work, HALF):
                 break

@@ -136,7 +136,7 @@ def render(
     if "inverse_depth" in outputs and (features is not None or not outputs <= {"color", "depth", "inverse_depth"}):
         raise ValueError("render: expected inverse_depth with color and depth alone, found normal or features")
     if "inverse_depth" in outputs:
-        outputs = outputs | {"color"}  # they are blended in one pass
+        outputs = frozenset[Output]({*outputs, "color"})  # they are blended in one pass
     implementation = _implementation(gaussians)
     _ = cameras.width  # refuses what cannot be stacked
     return implementation.render(gaussians, cameras, outputs=outputs, features=features, options=options)
