@@ -120,7 +120,7 @@ def compare(scene: Gaussians, photos: PosedImages) -> str:
 
 
 _BACKGROUNDS = {"grey": (0.5, 0.5, 0.5), "black": (0.0, 0.0, 0.0), "magenta": (1.0, 0.0, 1.0)}
-"""sRGB behind an object; what is see-through differs over them."""
+"""Background colours, sRGB; the see-through parts of an object differ between them."""
 
 
 def compare_object(found: Gaussians, photos: PosedImages) -> str:

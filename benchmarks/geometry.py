@@ -31,6 +31,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import psnr
 from splatgraft.core.images import read_mask, write_image
 from splatgraft.core.posed_images import PosedImages, held_out
+from splatgraft.evaluation import depth_colors, normal_colors, normals_from_depth
 from splatgraft.formats import read_capture
 from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import render
@@ -39,13 +40,10 @@ from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY
 from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE
 
 _OFF = 0.05  # relative error of the depth from which a pixel counts as off
-_SOLID = 0.5  # opacity from which a pixel shows a surface
 _NEAR_PX = 21  # around the object's mask, along rows and columns
 _SMOOTHED_PX = 5  # width of the box in which inverse depth is averaged before it is differenced
 _NO_NORMAL_DEG = 90.0  # error of the normal of a pixel that shows no surface
 _WARM_UP_STEPS = 2  # they load the kernels, whose time is not the reconstruction's
-_FAR_COLOR, _NEAR_COLOR = torch.tensor([0.08, 0.1, 0.4]), torch.tensor([1.0, 0.93, 0.3])
-_SHOWN = (0.02, 0.98)  # quantiles of the true inverse depth at the ends of the colours
 
 
 @dataclass(frozen=True)
@@ -153,7 +151,7 @@ def exam_scenes(folder: Path) -> Iterator[TrueScene]:
         depths, near = [], []
         for name in capture.cameras.names:
             depths.append(_read_depth(rendered / "target" / f"{Path(name).stem}_depth.npy"))
-            mask = (read_mask(rendered / "ground_truth" / f"{Path(name).stem}_mask.png") > _SOLID).float()
+            mask = (read_mask(rendered / "ground_truth" / f"{Path(name).stem}_mask.png") > 0.5).float()
             around = functional.max_pool2d(mask[None], 2 * _NEAR_PX + 1, 1, _NEAR_PX)[0]
             near.append((around > 0) & (mask == 0) & (depths[-1] > 0))
         yield TrueScene(f"{folder.resolve().name}-{path.name}", capture, tuple(depths), tuple(near))
@@ -181,7 +179,7 @@ def _read_depth(path: Path) -> Float[Tensor, "h w"]:
 def _drawn(scene: Gaussians, camera: Cameras) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
     """The colour, and the depth, which is 0 where no surface is seen."""
     found = render(scene, camera, outputs=frozenset({"color", "depth"}))
-    return found.color[0].clamp(0, 1), torch.where(found.alpha[0] < _SOLID, 0, found.depth[0])
+    return found.color[0].clamp(0, 1), found.depth[0]
 
 
 def measure(case: TrueScene, options: ReconstructOptions) -> tuple[Row, Gaussians]:
@@ -222,17 +220,9 @@ def picture(case: TrueScene, scene: Gaussians) -> Float[Tensor, "h w 3"]:
     index = int(torch.stack([near.sum() for near in case.near]).argmax())
     camera, truth = case.capture.cameras[index], case.depths[index]
     depth = _drawn(scene, camera)[1]
-    far, close = (1 / truth[truth > 0]).quantile(torch.tensor(_SHOWN)).tolist()
-
-    def colored(shown: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
-        """Blue where far, yellow where near, black where there is nothing."""
-        known = (shown > 0)[..., None]
-        level = ((1 / shown.clamp_min(1e-6) - far) / (close - far)).clamp(0, 1)[..., None]
-        return known * (_FAR_COLOR + level * (_NEAR_COLOR - _FAR_COLOR))
-
-    in_world = normals_of_depth(depth, camera) @ camera.world_from_camera[0, :3, :3].T
-    normals = (in_world + 1) / 2 * (depth > 0)[..., None]
-    return torch.cat([case.capture.image(index), colored(truth), colored(depth), normals], 1)
+    # coloured together, so that both maps have one scale
+    colors = depth_colors(torch.cat([truth, depth], 1))
+    return torch.cat([case.capture.image(index), colors, normal_colors(normals_from_depth(depth, camera))], 1)
 
 
 def table(rows: list[Row], quality: str) -> str:
@@ -292,7 +282,7 @@ def main() -> None:
         folder = options.out.with_suffix("")
         folder.mkdir(parents=True, exist_ok=True)
         write_image(folder / f"{case.name}.png", torch.cat(pictures))
-        # after each scene, so that a run that is stopped leaves what it has measured
+        # saved after each scene: a stopped run keeps its rows
         options.out.write_text(json.dumps({**head, "rows": [asdict(row) for row in rows]}, indent=1))
     if rows:
         blocks = [table(rows, quality) for quality in options.qualities]

@@ -5,9 +5,10 @@ from dataclasses import replace
 import pytest
 import torch
 from shapes import ring, surfels
+from test_gaussian_fit import as_views
 
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.fitting.gaussian_fit import FitOptions, LearningRates, View, fit
+from splatgraft.fitting.gaussian_fit import FitOptions, LearningRates, fit
 from splatgraft.fitting.surface_loss import SurfaceLoss
 from splatgraft.rendering import render
 
@@ -81,15 +82,7 @@ def test_a_bare_table_is_held_by_its_rim():
     truth, plain = table()
     cameras = ring(6)
     with torch.no_grad():
-        pictures = [render(truth, camera).color[0].clamp(0, 1) for camera in cameras]
-
-    class Photographs(list[View]):
-        def at(self, index: int, *, visit: int, done: float) -> View:
-            return self[index]
-
-    views = Photographs(
-        View(camera, (255 * picture).round().to(torch.uint8)) for camera, picture in zip(cameras, pictures, strict=True)
-    )
+        views = as_views(cameras, [render(truth, camera).color[0] for camera in cameras])
     # its middle sags, which no photograph shows
     sag = 0.2 * (1 - (truth.means[:, :2].abs().amax(1) / 0.75).square()).clamp_min(0)
     start = replace(truth, means=truth.means - sag[:, None] * UP)

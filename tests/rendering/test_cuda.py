@@ -48,12 +48,20 @@ def test_pictures_and_gradients_match_the_cpu(low_pass):
 def test_planes_of_inverse_depth_are_those_of_the_kernels(low_pass_px2):
     # pure torch, so that it is tested without a GPU: blended by the CPU as features, against the CPU's own moments
     options, view = RenderOptions(low_pass_px2=low_pass_px2), camera()
-    scene = random_scene(60, 0, seed=2)
-    ours = rendering.render(scene, view, outputs=frozenset({"inverse_depth"}), options=options)
-    channels = cuda.moment_channels(scene, view, options)
-    blended = rendering.render(scene, view, outputs=frozenset(), features=channels, options=options)
+    scene, other = (random_scene(60, 0, seed=2).map(lambda t: t.requires_grad_()) for _ in range(2))
+    ours = rendering.render(scene, view, outputs=frozenset({"inverse_depth"}), options=options).inverse_depth[0]
+    channels = cuda.moment_channels(other, view, options)
+    blended = rendering.render(other, view, outputs=frozenset(), features=channels, options=options)
+    theirs = cuda.moments(blended.features[0], view)
     # float32; sums of up to 0.4
-    assert (cuda.moments(blended.features[0], view) - ours.inverse_depth[0]).abs().max() < 1e-5
+    assert (theirs - ours).abs().max() < 1e-5
+    pixel_weights = torch.randn(ours.shape, generator=torch.Generator().manual_seed(3))
+    (pixel_weights * ours).sum().backward()
+    (pixel_weights * theirs).sum().backward()
+    for name in ("means", "log_scales", "quaternions", "opacity_logits"):
+        found, expected = getattr(scene, name).grad, getattr(other, name).grad
+        # nine sums of like numbers instead of two, in float32
+        assert (found - expected).abs().max() < 1e-3 * expected.abs().max(), name
 
 
 @needs_gpu

@@ -35,8 +35,8 @@ class PlaceOptions:
     """What the user decides; what is None is found."""
 
     point: tuple[float, float, float] | None = None
-    """The object is placed on the surface below this point of the target; None finds a visible, level place beside what
-    was captured there, on the same support."""
+    """Point of the target above the surface that carries the object. None: a visible, level place beside the captured
+    thing, on its support."""
     scale: float | None = None
     """Size in the target over size in the source; None guesses from the views, as captures have no common unit, and
     takes no less than half of the guess."""

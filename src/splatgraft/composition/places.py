@@ -45,7 +45,7 @@ _FLAT_ENOUGH = 0.8
 _SHRINK, _ROUNDS = 0.8, 8
 """Factor on the scale where no place is free, and scales tried."""
 _MIN_SIZE = 0.5
-"""Least size over the guess; a smaller object is out of proportion to what was captured."""
+"""Smallest allowed size, relative to the guess: a smaller object is out of proportion to the captured thing."""
 _LARGE = 0.2
 """Least area of the support over that of the largest level, and of the region that it carries over all ground, weighted
 by nearness to the focus point. A disc around that point is so large from .31 of the half width on, .2 of the cameras'
@@ -160,7 +160,7 @@ def suggest_places(
     up: Float[Tensor, "3"],
     scale: float | None = None,
 ) -> list[Suggestion]:
-    """Places beside what the cameras look at, on the same support, each with a scale: level ones in view first.
+    """Suggest places beside what the cameras look at, on the same support, the best first, each with a scale.
 
     Captures have no common unit of length, so a scale that is not given is a guess from the size in the images; it is
     reduced, to no less than half, where no free place is large enough. Levels below the support count only where the
@@ -233,7 +233,7 @@ def _suggestions(
 def _ground(
     target: Gaussians, focus: Float[Tensor, "3"], reach: float, *, cameras: Cameras, up: Float[Tensor, "3"]
 ) -> _Ground:
-    """The ground in the square of half width `reach` around `focus`; a ValueError where there is none."""
+    """Measure the ground in the square of half width `reach` around `focus`. ValueError if there is none."""
     up = torch.nn.functional.normalize(up.to(focus), dim=0)
     # surfaces lie below most cameras; ceilings and lamps do not
     top = max(float(((cameras.centers - focus) @ up).median()), _MIN_TOP * reach)

@@ -55,11 +55,12 @@ class SurfaceLoss:
             generator: Draws the axis and the distance of the second difference.
         """
         first, second = inverse_depth.unbind(-1)
-        bend = _bend(self.unit * first / alpha.clamp_min(_FAINT), alpha, image, generator)
+        mean = first / alpha.clamp_min(_FAINT)
+        bend = self.bend * _bend(self.unit * mean, alpha, image, generator)
         if done < self.spread_from:
-            return self.bend * bend
-        variance = self.unit**2 * (second - first.square() / alpha.clamp_min(_FAINT))
-        return self.bend * bend + self.spread * variance.clamp_min(0).log1p().mean()
+            return bend
+        variance = self.unit**2 * (second - first * mean)
+        return bend + self.spread * variance.clamp_min(0).log1p().mean()
 
 
 def _bend(

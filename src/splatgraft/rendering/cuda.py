@@ -78,7 +78,10 @@ def inverse_depth_planes(
     slope = torch.linalg.solve(blurred, covariance[:, :2, 2])
     variance = covariance[:, 2, 2] - (slope * covariance[:, :2, 2]).sum(1)
     at_axis = 1 / z - (slope * center).sum(1)
-    return torch.cat([at_axis[:, None], slope], 1), variance
+    planes = torch.cat([at_axis[:, None], slope], 1)
+    # the plane of a Gaussian whose centre is out of view is extrapolated: no gradient, as in the CPU's kernels
+    in_view = (held == center).all(1)
+    return torch.where(in_view[:, None], planes, planes.detach()), torch.where(in_view, variance, variance.detach())
 
 
 def moment_channels(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> Float[Tensor, "n 9"]:
@@ -90,9 +93,7 @@ def moment_channels(gaussians: Gaussians, camera: Cameras, options: RenderOption
 
 def moments(sums: Float[Tensor, "h w 9"], camera: Cameras) -> Float[Tensor, "h w 2"]:
     """Moments of inverse depth from the blended channels of `moment_channels`."""
-    k = camera.intrinsics[0].to(sums)
-    x = ((torch.arange(camera.width).to(sums) + 0.5 - k[0, 2]) / k[0, 0])[None]
-    y = ((torch.arange(camera.height).to(sums) + 0.5 - k[1, 2]) / k[1, 1])[:, None]
+    x, y, _ = camera.rays().to(sums).unbind(-1)
     a, b, d, aa, ab, ad, bb, bd, dd = sums.unbind(-1)
     first = a + b * x + d * y
     second = aa + 2 * (ab * x + ad * y + bd * x * y) + bb * x.square() + dd * y.square()

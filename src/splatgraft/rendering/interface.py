@@ -51,14 +51,17 @@ class Render:
 
     @property
     def depth(self) -> Float[Tensor, "v h w"]:
-        """Median depth: distance along the optical axis at which the transmittance falls below one half, world units; 0
-        where it never does. It has no gradient."""
+        """Median depth along the optical axis, world units: where the transmittance falls below one half. 0 if it never
+        does, which is where alpha is below one half. It has no gradient."""
         return self._asked("depth")
 
     @property
     def inverse_depth(self) -> Float[Tensor, "v h w 2"]:
-        """First and second moment of inverse depth along each ray, not divided by alpha: sums of w c and of w (c^2 + v)
-        over Gaussians with blending weight w, mean c and variance v given the pixel; per world unit, and its square."""
+        """First and second moment of inverse depth along each ray, per world unit and its square.
+
+        They are sums over Gaussians of w c and of w (c^2 + v), not divided by alpha: w is the blending weight, c and v
+        are the mean and the variance of the Gaussian's inverse depth in this pixel.
+        """
         return self._asked("inverse_depth")
 
     @property

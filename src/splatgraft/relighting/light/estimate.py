@@ -79,8 +79,6 @@ _CLIPPED_ERROR_DEG = 2.0
 """Error of the middle of a clipped patch."""
 
 # the view towards a source; set by hand
-_SURFACE_ALPHA = 0.5
-"""A pixel of a depth image above this alpha shows a surface."""
 _SOURCE_IMAGE = (32.0, 16)
 """Focal length and width, pixels, of the depth image."""
 _SOURCE_QUANTILE = 0.25
@@ -274,7 +272,7 @@ def with_source_distances(light: Light, scene: Gaussians, place: BoundingSphere)
         up = torch.tensor([0.0, 0.0, 1.0]) if abs(source.direction[2]) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
         pose = look_at(place.center[None], place.center + direction, up)
         rendered = render(scene, pinhole(pose, focal, width=width, height=width), outputs=frozenset({"depth"}))
-        visible = (rendered.alpha > _SURFACE_ALPHA) & (rendered.depth > place.radius)
+        visible = rendered.depth > place.radius
         distance = float(rendered.depth[visible].quantile(_SOURCE_QUANTILE)) if bool(visible.any()) else math.inf
         sources.append(replace(source, blockers_within=_BLOCKERS_WITHIN * distance))
     return replace(light, sources=tuple(sources))

@@ -50,8 +50,6 @@ NEAREST = 0.5
 """Object radii within which Gaussians are left out of the panorama."""
 _TEST_SIZE = 24
 """Pixels; width of a face of the depth cube map that tests whether the place is inside something."""
-_SURFACE_ALPHA = 0.5
-"""A pixel of a depth image above this alpha shows a surface."""
 _BLOCKED_WITHIN = 0.4
 """Object radii; a nearer surface blocks the view."""
 _MAX_BLOCKED = 0.6
@@ -192,7 +190,7 @@ def panorama_at(scene: Gaussians, place: BoundingSphere) -> Panorama | NoLight:
     if scene.count == 0:
         return NoLight("The scene is empty.")
     rendered = render(scene, cube_cameras(place.center, _TEST_SIZE), outputs=frozenset({"depth"}))
-    blocked = (rendered.alpha > _SURFACE_ALPHA) & (rendered.depth < _BLOCKED_WITHIN * place.radius)
+    blocked = (rendered.depth > 0) & (rendered.depth < _BLOCKED_WITHIN * place.radius)
     if float(blocked.float().mean()) > _MAX_BLOCKED:
         return NoLight("The object is inside a wall or another thing: there is no light to be found there.")
     panorama = render_panorama(scene, place.center, nearest=NEAREST * place.radius)
