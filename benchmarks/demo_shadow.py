@@ -30,8 +30,7 @@ from splatgraft.relighting.shadows.shadow_maps import occluders_of
 
 SUN = F.normalize(torch.tensor([-0.26938, 0.91658, 0.29548]), dim=0)
 """Towards the sun of data/render_table.py."""
-_RADII = 6.4
-"""Object radii of the region around the table."""
+_RADII = 6.4  # object radii of the region around the table
 _CORE, _REACH = 3, 14
 """Texels: distance from the edge from which on a shadow is at its darkest, and up to which the profile is taken."""
 

@@ -56,8 +56,7 @@ FACTORS = {
 """Standard deviation of each number's random factor."""
 SHIFTS = {"sky_bias": 0.3}
 """The same of a number that may be negative, added."""
-_WORSE = 0.01
-"""Stops by which a change may be worse on half of the scenes before it is dropped."""
+_WORSE = 0.01  # stops by which a change may be worse on half of the scenes before it is dropped
 
 
 @dataclass(frozen=True)

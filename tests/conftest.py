@@ -24,8 +24,7 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 
-_THREAD_SECONDS = 60.0
-"""Longest wait for all threads: that of a page which no test closed never ends."""
+_THREAD_SECONDS = 60.0  # longest wait for all threads: that of a page which no test closed never ends
 
 _STORY_SECONDS = 600
 """Seconds after which a test in a browser is taken for a hang; pytest-timeout then shows what each thread does."""

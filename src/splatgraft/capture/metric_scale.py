@@ -32,8 +32,7 @@ _DICTIONARIES = (
 _MAX_MISS_PX = 3.0
 """Mean distance, pixels, of a corner, projected, from where it was found: corners are found to a pixel, poses of a
 plausible capture are right to one or two."""
-_MIN_ANGLE = 1e-4
-"""Least sum of squared sines of the angles between the rays of a point: a degree between two."""
+_MIN_ANGLE = 1e-4  # least sum of squared sines of the angles between the rays of a point: a degree between two
 
 
 def triangulate(cameras: Cameras, pixels: Float[Tensor, "v 2"]) -> tuple[Float[Tensor, "3"], float]:

@@ -27,35 +27,25 @@ from splatgraft.runtime.progress import Progress, silent
 
 SIDE_PX = 640
 """Longest side of the grey versions: that of a draft reconstruction."""
-_FEATURES = 1200
-"""SIFT features per photo, the strongest."""
-_NEIGHBOURS = 3
-"""Photos that follow in the order of names (in a ring) with which each is matched."""
-_RATIO = 0.8
-"""Distance of the best match over that of the second, at most (Lowe 2004)."""
-_EPIPOLAR_PX = 1.5
-"""Distance of a match from its epipolar line, at most."""
-_MIN_MATCHES = 15
-"""Verified matches from which two photos show the same place: what COLMAP demands (min_num_inliers)."""
-_PARTNERS = 4
-"""Photos anywhere in the order with which a photo is matched that its neighbours do not hold."""
+_FEATURES = 1200  # SIFT features per photo, the strongest
+_NEIGHBOURS = 3  # photos that follow in the order of names (in a ring) with which each is matched
+_RATIO = 0.8  # distance of the best match over that of the second, at most (Lowe 2004)
+_EPIPOLAR_PX = 1.5  # distance of a match from its epipolar line, at most
+_MIN_MATCHES = 15  # verified matches from which two photos show the same place: what COLMAP demands (min_num_inliers)
+_PARTNERS = 4  # photos anywhere in the order with which a photo is matched that its neighbours do not hold
 _PARTNER_FEATURES = 300
 """Largest features of a photo by which its partners are found (preemptive matching: Wu 2013, section 3)."""
-_STILL_PX = 0.5
-"""Shift below which a match does not move: below what a hand can hold still."""
+_STILL_PX = 0.5  # shift below which a match does not move: below what a hand can hold still
 
 # limits of the findings, measured on the two captures that ship, two public ones and a rendered room
-_FEW = 20
-"""Photos; the 16 of the shipped bananas are near the limit."""
+_FEW = 20  # photos; the 16 of the shipped bananas are near the limit
 _BLUR_OF_ALL = 0.5
 """Median blur. Sharp captures have 0.23 to 0.37; motion by 5 pixels at 640 lifts these to 0.4 to 0.54."""
 _JUMP_STOPS = 0.4
 """Brightness of a photo against those before and after, as of the exposure settings; captures of fixed exposure have up
 to 0.31."""
-_MIN_TOGETHER = 0.5
-"""Share of the photos that hang together: what structure from motion demands of poses."""
-_NAMED = 6
-"""Photos that a finding names; it counts the others."""
+_MIN_TOGETHER = 0.5  # share of the photos that hang together: what structure from motion demands of poses
+_NAMED = 6  # photos that a finding names; it counts the others
 
 Grey = UInt8[np.ndarray, "h w"]
 """sRGB luma."""

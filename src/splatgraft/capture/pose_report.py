@@ -16,20 +16,16 @@ POSE_REPORT_FILE = "pose_report.json"
 
 _FEW_FEATURES = 500
 """Features; a photo of a usual scene has some thousands, of which one in ten is found again in the next photo."""
-_FEW_MATCHES = 30
-"""Matches that a pose takes (COLMAP: abs_pose_min_num_inliers)."""
+_FEW_MATCHES = 30  # matches that a pose takes (COLMAP: abs_pose_min_num_inliers)
 
 # the ranges of the figures of ordinary photos
 _MIN_REGISTERED = 0.7
 """Share of photos with a pose: without a third of them it is still a result, whose missing photos are named."""
 _MIN_EXPLAINED = 0.5
 """Share of verified matches: more than half. Models of the shipped room, vase and bananas: 0.59 to 0.87."""
-_MAX_REPROJECTION_PX = 1.0
-"""Pixels: three times the third of a pixel to which SIFT places a feature (Lowe 2004)."""
-_MIN_OBSERVATIONS = 100
-"""Points seen by the median photo: what COLMAP demands of the first pair (init_min_num_inliers)."""
-_FOCAL_IN_SIDES = (0.4, 4.0)
-"""Focal length over the longest side: 14 mm and 140 mm on a sensor of 36 mm."""
+_MAX_REPROJECTION_PX = 1.0  # pixels: three times the third of a pixel to which SIFT places a feature (Lowe 2004)
+_MIN_OBSERVATIONS = 100  # points seen by the median photo: what COLMAP demands of the first pair (init_min_num_inliers)
+_FOCAL_IN_SIDES = (0.4, 4.0)  # focal length over the longest side: 14 mm and 140 mm on a sensor of 36 mm
 _MAX_CORNER_SHIFT = 0.25
 """Share of its distance from the middle by which a corner is moved; more is a fisheye, which is not modelled."""
 _MAX_CORNER_SPREAD = 0.1

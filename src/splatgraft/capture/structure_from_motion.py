@@ -31,14 +31,11 @@ _ADVICE = (
     "take more photos, a step apart, with two thirds overlap, sharp, of a still scene with texture around plain or "
     "shiny things, at one zoom setting (or say that each photo has its own camera: lens = each)"
 )
-_EXHAUSTIVE = 80
-"""Most photos of which all pairs are compared unless asked for."""
-_ENOUGH = 0.5
-"""Share of the photos that need a pose; the rest is named and left out."""
+_EXHAUSTIVE = 80  # most photos of which all pairs are compared unless asked for
+_ENOUGH = 0.5  # share of the photos that need a pose; the rest is named and left out
 _THOROUGH_COST = 40
 """Time of a thorough attempt over that of a quick one: features of affine shape, more of them, guided matching."""
-_SECONDS_PER_PHOTO = 1.7
-"""On two idle cores: 80 photos of 1280 px took 118 s, 50 of 1600 px 91 s."""
+_SECONDS_PER_PHOTO = 1.7  # on two idle cores: 80 photos of 1280 px took 118 s, 50 of 1600 px 91 s
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,7 @@ _MIN_PARALLAX_DEG = 3.0
 moves a point by 2% of its distance."""
 _POINTS, _CAMERAS = 256, 128
 """Most points and cameras that are compared, evenly spaced in their order."""
-_MIN_SIDE_PX = 16
-"""Shorter side; smaller pictures hold no window of SSIM (11 px) and no features."""
+_MIN_SIDE_PX = 16  # shorter side; smaller pictures hold no window of SSIM (11 px) and no features
 _MEASURED_PX = 800
 """Longest side at which blur is measured, or the median photo's where that is smaller, so that a photo which is larger
 than the others counts by what is left of it when it is as small."""
@@ -46,8 +45,7 @@ _BLUR_DEVIATIONS = 4.0
 """Robust standard deviations (1.4826 median absolute deviations) below the median, at least, of a blurred photo."""
 _COARSE_HALVINGS = 4
 """A blur that is wide enough to take coarse detail as well must not pass for sharp: a sixteenth holds up to 16 px."""
-_COARSE_PX = 8
-"""Least side at that size for its detail to mean anything."""
+_COARSE_PX = 8  # least side at that size for its detail to mean anything
 _THUMBNAIL_PX = 64
 _COPY_LEVELS = 4.0
 """Largest difference between two thumbnails that are of one picture, grey levels of 255: that of a JPEG saved again;

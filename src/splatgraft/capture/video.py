@@ -22,32 +22,21 @@ from splatgraft.runtime.progress import Progress, silent
 VIDEO_FRAMES = 120
 """Frames taken of a video, where it has as many and different views."""
 _MIN_FRAMES = 3
-_SHARPNESS_PX = 480
-"""Longest side at which sharpness is measured, so that it does not depend on the resolution."""
+_SHARPNESS_PX = 480  # longest side at which sharpness is measured, so that it does not depend on the resolution
 _MISSING_SHARE = 0.02
 """Share of the announced frames that may be missing before the file counts as cut off; containers count roughly."""
-_TRACKED_PX = 320
-"""Longest side at which corners are tracked."""
-_CORNERS = 200
-"""Corners that are tracked."""
-_MIN_CORNERS = 8
-"""Corners below which a frame has nothing to track, such as a black one."""
-_RETURNED_PX = 1.0
-"""Largest error of a corner tracked forth and back."""
-_RENEWED_AFTER = 0.05
-"""Displacement after which another reference frame is taken."""
-_RENEWED_BELOW = 0.6
-"""Share of corners still tracked below which another is taken."""
+_TRACKED_PX = 320  # longest side at which corners are tracked
+_CORNERS = 200  # corners that are tracked
+_MIN_CORNERS = 8  # corners below which a frame has nothing to track, such as a black one
+_RETURNED_PX = 1.0  # largest error of a corner tracked forth and back
+_RENEWED_AFTER = 0.05  # displacement after which another reference frame is taken
+_RENEWED_BELOW = 0.6  # share of corners still tracked below which another is taken
 _CUT_BELOW = 0.3
 """Share of corners tracked from the frame before below which it is another shot; blurred motion has 0.6."""
-_MIN_STEP = 0.02
-"""Motion between two frames, at least: 13 pixels of 640, from which structure from motion gains depth."""
-_STRETCH_MARGIN = 0.2
-"""Share of a stretch at either end that is avoided, so that neighbours do not meet there."""
-_WIDE_STEP = 0.15
-"""Motion between frames above which they may overlap too little."""
-_STANDING_S = 1.0
-"""Shortest time of standing still that is mentioned, seconds."""
+_MIN_STEP = 0.02  # motion between two frames, at least: 13 pixels of 640, from which structure from motion gains depth
+_STRETCH_MARGIN = 0.2  # share of a stretch at either end that is avoided, so that neighbours do not meet there
+_WIDE_STEP = 0.15  # motion between frames above which they may overlap too little
+_STANDING_S = 1.0  # shortest time of standing still that is mentioned, seconds
 _NAMED_CUTS = 5
 
 

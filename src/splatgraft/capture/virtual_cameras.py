@@ -24,60 +24,40 @@ from splatgraft.rendering import render
 from splatgraft.runtime.note import Note
 from splatgraft.runtime.progress import Progress, silent
 
-_HALF_FOV = math.radians(30)
-"""Half the horizontal field of view of the pictures, radians."""
-_MIN_VIEWS = 8
-"""Number of poses that are kept even where they are occluded."""
+_HALF_FOV = math.radians(30)  # half the horizontal field of view of the pictures, radians
+_MIN_VIEWS = 8  # number of poses that are kept even where they are occluded
 
 # what is solid, and which plane is a floor
-_MIN_OPACITY = 0.3
-"""Opacity above which a Gaussian counts as solid."""
-_MAX_SCALE = 20.0
-"""Scale over the median one from which a Gaussian counts as backdrop."""
+_MIN_OPACITY = 0.3  # opacity above which a Gaussian counts as solid
+_MAX_SCALE = 20.0  # scale over the median one from which a Gaussian counts as backdrop
 _MAX_POINTS, _MIN_POINTS = 20_000, 20
 """Solid Gaussians that are used, and that are needed."""
-_TRIM_ROUNDS = 10
-"""Means of the nearer half of the points, each around the one before."""
-_PLANE_POINTS = 4000
-"""Points that planes are fitted to, about the dense part within twice its radius."""
-_TRIALS = 1000
-"""Random planes."""
-_THICKNESS = 0.02
-"""Largest distance of a point that counts as on a plane."""
+_TRIM_ROUNDS = 10  # means of the nearer half of the points, each around the one before
+_PLANE_POINTS = 4000  # points that planes are fitted to, about the dense part within twice its radius
+_TRIALS = 1000  # random planes
+_THICKNESS = 0.02  # largest distance of a point that counts as on a plane
 _ALIGNED_COS = math.cos(math.radians(25.0))
 """Cosine of the angle to a customary up direction (y or z of the file) below which a plane is taken for a floor."""
-_UNALIGNED_WEIGHT = 0.6
-"""Factor on the points of other planes: walls are as large as floors."""
-_MIN_SHARE = 0.1
-"""Least share of the points on the plane."""
-_SIDE_RATIO = 3.0
-"""Points on one side of the plane over those on the other, above which the first side is up."""
+_UNALIGNED_WEIGHT = 0.6  # factor on the points of other planes: walls are as large as floors
+_MIN_SHARE = 0.1  # least share of the points on the plane
+_SIDE_RATIO = 3.0  # points on one side of the plane over those on the other, above which the first side is up
 _HOLLOW_SHARE = 0.08
 """Share of points within half the radius below which a scene is hollow: a solid ball has 0.06, a table more."""
 
 # candidate positions, and what occludes them
 _DISTANCES = (2.4, 1.7, 3.4, 1.2)
 """Distances of eyes around the dense part from its centre, the best first: at 2.4 it fills the picture."""
-_ELEVATIONS_DEG = (20.0, 42.0)
-"""Elevations of the rings around the dense part."""
-_CLEAR = 1.1
-"""Distance from the centre towards the eye beyond which anything occludes the dense part."""
-_CLEAR_AT_EDGES = 0.35
-"""Distance from the eye, over that of the centre, below which anything occludes the picture."""
-_HEIGHTS = (0.2, 0.6, 0.0)
-"""Heights of eyes within the scene above the centre, the best first."""
-_ELEVATIONS_WITHIN_DEG = (0.0, -25.0)
-"""Elevations of views out of the scene."""
-_STEP_BACK = 0.3
-"""Horizontal distance of eyes within the scene from the centre, against the view."""
+_ELEVATIONS_DEG = (20.0, 42.0)  # elevations of the rings around the dense part
+_CLEAR = 1.1  # distance from the centre towards the eye beyond which anything occludes the dense part
+_CLEAR_AT_EDGES = 0.35  # distance from the eye, over that of the centre, below which anything occludes the picture
+_HEIGHTS = (0.2, 0.6, 0.0)  # heights of eyes within the scene above the centre, the best first
+_ELEVATIONS_WITHIN_DEG = (0.0, -25.0)  # elevations of views out of the scene
+_STEP_BACK = 0.3  # horizontal distance of eyes within the scene from the centre, against the view
 _CLEAR_WITHIN, _CLEAR_AT_EDGES_WITHIN = 0.3, 0.15
 """Distance from an eye within the scene below which anything occludes the middle of the picture, and the picture."""
-_MIN_SEEN_WITHIN = 0.5
-"""Least mean opacity of a picture from within."""
-_OCCLUDED = 0.1
-"""Occluded share from which a position is not taken."""
-_MIDDLE_WEIGHT = 0.3
-"""Factor on the occluded share of the picture's middle against that of the whole picture."""
+_MIN_SEEN_WITHIN = 0.5  # least mean opacity of a picture from within
+_OCCLUDED = 0.1  # occluded share from which a position is not taken
+_MIDDLE_WEIGHT = 0.3  # factor on the occluded share of the picture's middle against that of the whole picture
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,8 @@ from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.segmentation import WIDE_GAP_DEG, widest_gap
 
-_FRAMES = 40
-"""Frames of a video that are looked at; the command `capture` takes 120."""
-_DRAFT_SECONDS = 45.0
-"""For a draft of any size; two idle cores."""
+_FRAMES = 40  # frames of a video that are looked at; the command `capture` takes 120
+_DRAFT_SECONDS = 45.0  # for a draft of any size; two idle cores
 _FOCAL_LENGTH = 0x920A
 
 

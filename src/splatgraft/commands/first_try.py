@@ -23,8 +23,7 @@ from splatgraft.workflow.run import run_steps
 
 DRAFT = {"quality": "draft"}
 """Keys of [reconstruct] of a first try."""
-_FINER = {"draft": "standard", "standard": "high"}
-"""The quality after each."""
+_FINER = {"draft": "standard", "standard": "high"}  # the quality after each
 
 
 @dataclass(frozen=True)

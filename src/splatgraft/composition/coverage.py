@@ -12,10 +12,8 @@ from splatgraft.core.directions import tangents
 # set by hand
 _PHOTOGRAPHED_DEG = 50.0
 """Largest angle to a photograph's direction from which a side of the object was seen well enough."""
-_SIDE_PX = 320
-"""Width and height of the picture."""
-_LOWEST_DEG = -20.0
-"""Elevation at the rim of the picture."""
+_SIDE_PX = 320  # width and height of the picture
+_LOWEST_DEG = -20.0  # elevation at the rim of the picture
 _DOT_PX = 4.0
 _SEEN, _UNSEEN, _OUTSIDE = (0.85, 0.90, 0.84), (0.93, 0.70, 0.63), (1.0, 1.0, 1.0)
 _PHOTOGRAPH, _VIEW = (0.15, 0.15, 0.17), (0.16, 0.36, 0.80)

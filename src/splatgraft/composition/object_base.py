@@ -31,23 +31,17 @@ class ObjectBase:
 
 
 # set by hand; shares of the object's weight
-_HEIGHT_TRIM = 0.01
-"""Beyond its lowest and its highest level."""
-_MIDDLE_TRIM = 0.02
-"""Beyond either end of its horizontal extent, whose middle is taken."""
+_HEIGHT_TRIM = 0.01  # beyond its lowest and its highest level
+_MIDDLE_TRIM = 0.02  # beyond either end of its horizontal extent, whose middle is taken
 _WITHIN_RADIUS = 0.97
 # lengths over the object's height or radius
-_SEARCH_HEIGHT = 0.3
-"""Height above the lowest part from which the ground is searched downwards."""
-_DISC_RADIUS = 2.0
-"""Radius of the searched disc: nothing was seen under the object, so its surroundings count."""
+_SEARCH_HEIGHT = 0.3  # height above the lowest part from which the ground is searched downwards
+_DISC_RADIUS = 2.0  # radius of the searched disc: nothing was seen under the object, so its surroundings count
 _MAX_RISE = 0.1
 """Largest height of the ground above the lowest part: masks that take more of the ground are rare, and what hangs on a
 wall has edges of other things beside it that look like ground."""
-_MAX_GAP = 0.25
-"""Largest depth of the ground below the lowest part: masks do not miss more of a foot."""
-_MIN_FLAT = 0.25
-"""Least share of the disc that lies on the ground."""
+_MAX_GAP = 0.25  # largest depth of the ground below the lowest part: masks do not miss more of a foot
+_MIN_FLAT = 0.25  # least share of the disc that lies on the ground
 
 
 def object_base(

@@ -26,8 +26,7 @@ _CLEARLY_BETTER = 1.5
 """By which factor a later place has to be better: an earlier one is nearer to where the cameras look."""
 _YAW_SPREAD_DEG, _YAW_STEP_DEG = 30.0, 5
 """Standard deviation of the azimuth that a photograph covers around its own, and distance of the yaws tried."""
-_GOOD_YAW = 0.98
-"""Coverage over the best one above which the smallest turn is preferred."""
+_GOOD_YAW = 0.98  # coverage over the best one above which the smallest turn is preferred
 
 
 @dataclass(frozen=True)

@@ -23,25 +23,18 @@ from splatgraft.runtime.note import Note
 # set by hand
 _VIEWS, _VIEW_WIDTH_PX = 12, 240
 """Cameras that are tested for what hides a point, evenly spaced, and the width of their depth images."""
-_IMAGE_SHARE = 0.3
-"""Object height over image height in the median view, where the scale is not given."""
-_REACH = 0.7
-"""Half width of the searched square over the cameras' median horizontal distance from the focus point."""
-_MIN_TOP = 0.05
-"""Least height of the searched space above the focus point, over the half width."""
-_MAP_SIZE_PX = 128
-"""Width and height of the height map."""
-_CENTER_SPREAD = 0.5
-"""Standard deviation of the distance from the focus point in the score, over the half width."""
+_IMAGE_SHARE = 0.3  # object height over image height in the median view, where the scale is not given
+_REACH = 0.7  # half width of the searched square over the cameras' median horizontal distance from the focus point
+_MIN_TOP = 0.05  # least height of the searched space above the focus point, over the half width
+_MAP_SIZE_PX = 128  # width and height of the height map
+_CENTER_SPREAD = 0.5  # standard deviation of the distance from the focus point in the score, over the half width
 _MARGIN = 1.25
 """Radius of the ground that is wanted level over the object's, which leaves out its outermost parts: corners must not
 reach over the edge of a table."""
 _ROOM = 3.0
 """Radius of the ground that should not fall away, over the object's: its rim is as far from an edge as it is wide."""
-_NEAR_THE_EDGE = 0.7
-"""Share of that ground below which the object stands near an edge; on a straight edge it is a half."""
-_FLAT_ENOUGH = 0.8
-"""Share of level ground at which the object is not made smaller."""
+_NEAR_THE_EDGE = 0.7  # share of that ground below which the object stands near an edge; on a straight edge it is a half
+_FLAT_ENOUGH = 0.8  # share of level ground at which the object is not made smaller
 _SHRINK, _ROUNDS = 0.8, 8
 """Factor on the scale where no place is free, and scales tried."""
 _MIN_SIZE = 0.5
@@ -55,19 +48,14 @@ _SUPPORT_TOLERANCE = 0.05
 _ABOVE_FOCUS = 0.15
 """Largest height of the support above the focus point, over the half width. Cameras that look at a bare table may meet
 below it, by a tenth of their distance."""
-_MIN_SCORE = 0.01
-"""Below it no place is level and in view."""
+_MIN_SCORE = 0.01  # below it no place is level and in view
 _MAX_PLACES = 6
 _FLAT_SLOPE = 0.08
 """Height difference that counts as level over the object's radius: noise and a slope of a few degrees."""
-_IMAGE_MARGIN = 0.05
-"""Border of the image in which a place does not count as visible, over the image size."""
-_SLACK = 0.03
-"""Depth by which a point may lie behind the surface, over the object's extent: the width of both surfaces."""
-_EXTENT_TRIM = 0.05
-"""Share of points beyond either end of the extent."""
-_PICTURE_PX = 640
-"""Longest side of the picture of the free places."""
+_IMAGE_MARGIN = 0.05  # border of the image in which a place does not count as visible, over the image size
+_SLACK = 0.03  # depth by which a point may lie behind the surface, over the object's extent: the width of both surfaces
+_EXTENT_TRIM = 0.05  # share of points beyond either end of the extent
+_PICTURE_PX = 640  # longest side of the picture of the free places
 _FREE, _TAKEN = (0.20, 0.75, 0.30), (0.85, 0.20, 0.15)
 """sRGB of free places and of what stands on the support."""
 

@@ -13,8 +13,7 @@ from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import RenderOptions, render
 
-_CAMERA_DISTANCE = 24.0
-"""Distance of the camera over the radius: rays are vertical within 2.4 degrees."""
+_CAMERA_DISTANCE = 24.0  # distance of the camera over the radius: rays are vertical within 2.4 degrees
 
 
 @dataclass(frozen=True)
@@ -75,28 +74,20 @@ def height_map(
 
 
 # lengths over the radius of the disc, set by hand
-_MAX_SLOPE = 0.35
-"""Sine of the largest slope that counts as level: 20 degrees, mainly for errors of the estimated up."""
-_CLEARANCE = 0.25
-"""Height above the point from which the surface is searched downwards, where it is not given."""
-_DISC_SIZE_PX = 64
-"""Width and height of the height map."""
-_MIN_PIXELS = 8
-"""Solid pixels of the height map below which there is no surface."""
+_MAX_SLOPE = 0.35  # sine of the largest slope that counts as level: 20 degrees, mainly for errors of the estimated up
+_CLEARANCE = 0.25  # height above the point from which the surface is searched downwards, where it is not given
+_DISC_SIZE_PX = 64  # width and height of the height map
+_MIN_PIXELS = 8  # solid pixels of the height map below which there is no surface
 _WIDENED = (1.0, 2.0, 4.0)
 """Radii of the discs, over the given one, until one has a surface: the place may be a hole in the scene."""
-_LEVEL_STEP = 0.05
-"""Width of a bin of the histogram of heights."""
+_LEVEL_STEP = 0.05  # width of a bin of the histogram of heights
 _TOLERANCES = (0.3, 0.2, 0.12, 0.08, 0.06, 0.06)
 """Distance from the plane of the points that each fit takes: from 20 degrees of slope to surface noise."""
-_ON_SURFACE = 0.06
-"""Largest distance of a point from the plane that is fitted to it."""
+_ON_SURFACE = 0.06  # largest distance of a point from the plane that is fitted to it
 _LEVEL = 0.15
 """Distance from the plane within which ground is level, folds of a cloth included; what is higher obstructs."""
-_MAX_ERROR = 0.12
-"""Bound on the distance of a point when a sloped plane is compared with a level one."""
-_SLOPE_GAIN = 0.7
-"""Largest error of the sloped plane over that of the level one; a slope that explains less is noise."""
+_MAX_ERROR = 0.12  # bound on the distance of a point when a sloped plane is compared with a level one
+_SLOPE_GAIN = 0.7  # largest error of the sloped plane over that of the level one; a slope that explains less is noise
 
 
 @dataclass(frozen=True)

@@ -22,15 +22,12 @@ from splatgraft.fitting.perceptual_losses import ImageLoss
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
 # set by hand
-_CHANGED_SHARE = 0.02
-"""Share of a Gaussian's blending weight on changed pixels above which it is active."""
+_CHANGED_SHARE = 0.02  # share of a Gaussian's blending weight on changed pixels above which it is active
 _VISIBLE_SHARE = 1.0 / 255
 """Share of a pixel that active Gaussians make up, from which it lies in the window: one grey level."""
-_MARGIN_PX = 16
-"""Border of the windows, so that windowed losses and SSIM see the surroundings."""
+_MARGIN_PX = 16  # border of the windows, so that windowed losses and SSIM see the surroundings
 
-_SAVE_EVERY = 500
-"""Iterations of a descent between two checkpoints."""
+_SAVE_EVERY = 500  # iterations of a descent between two checkpoints
 
 
 @dataclass(frozen=True)

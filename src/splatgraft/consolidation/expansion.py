@@ -18,10 +18,8 @@ from splatgraft.fitting import adam
 from splatgraft.rendering.cpu_basis import basis_at
 from splatgraft.runtime.kernels import kernel, serialized
 
-_PART = 512
-"""Gaussians of one task of a kernel."""
-_MAX_COEFFICIENTS = 16
-"""Coefficients of degree 3."""
+_PART = 512  # gaussians of one task of a kernel
+_MAX_COEFFICIENTS = 16  # coefficients of degree 3
 
 
 @dataclass(frozen=True)

@@ -19,19 +19,14 @@ from splatgraft.runtime.progress import Progress, silent
 _ROUNDS, _STEPS = 3, 6
 """Times that targets are corrected and the equations solved, each from the last solution; and steps of conjugate
 gradient per round, which blend every view once and apply the transpose once."""
-_PRIOR_PX = 0.1
-"""Ridge towards the composite's colour, pixels: it decides only Gaussians that no view sees."""
+_PRIOR_PX = 0.1  # ridge towards the composite's colour, pixels: it decides only Gaussians that no view sees
 _BAND_RIDGES = (0.003, 0.02, 0.1)
 """Ridges of the higher bands to choose from, as shares of the pixels that the Gaussian makes up. Which one predicts
 held-out views best depends on how much the views disagree. Below ten views: the largest."""
-_FACTORED_AT_ONCE = 2**14
-"""Gaussians per batch of Cholesky factorisations, which bounds the memory."""
-_SUMMED_AT_ONCE = 2**12
-"""Gaussians per batch of a dot product."""
-_COMPARED_VIEWS = 40
-"""Views at most on which ridges are compared."""
-_HOLD_OUT_EVERY = 5
-"""Every how many views one is left out while ridges are compared."""
+_FACTORED_AT_ONCE = 2**14  # gaussians per batch of Cholesky factorisations, which bounds the memory
+_SUMMED_AT_ONCE = 2**12  # gaussians per batch of a dot product
+_COMPARED_VIEWS = 40  # views at most on which ridges are compared
+_HOLD_OUT_EVERY = 5  # every how many views one is left out while ridges are compared
 
 
 @dataclass(frozen=True)

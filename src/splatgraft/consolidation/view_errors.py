@@ -17,13 +17,10 @@ from splatgraft.consolidation.frozen_views import Views, memory_bytes
 # set by hand
 _FLOW_CELL_PX, _TINT_CELL_PX = 32.0, 88.0
 """Distance between the knots of the flow and of the tint."""
-_FLOW_SIGMA_PX = 0.5
-"""Expected size of the flow: the ridge that keeps it small where the image has no texture."""
+_FLOW_SIGMA_PX = 0.5  # expected size of the flow: the ridge that keeps it small where the image has no texture
 _MAX_FLOW_PX = 4.0 * _FLOW_SIGMA_PX
-_TINT_SIGMA = 0.1
-"""Expected size of the logarithm of the gain."""
-_RESIDUAL_SIGMA = 0.05
-"""Expected size of the remaining residual; larger ones count less (Geman-McClure weights)."""
+_TINT_SIGMA = 0.1  # expected size of the logarithm of the gain
+_RESIDUAL_SIGMA = 0.05  # expected size of the remaining residual; larger ones count less (Geman-McClure weights)
 _CORRELATED_PX = 16.0
 """Pixels over which a residual (a misplaced edge, a wrong shade) stays alike and counts as one observation."""
 

@@ -8,25 +8,18 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 
-_ROUNDS = 10
-"""Rounds of reweighting; this and the others are set by hand."""
-_ROLL_RAD = 0.05
-"""Roll above which a camera counts less: hand-held cameras are level to about three degrees."""
-_MEAN_UP_WEIGHT = 0.01
-"""Weight of the images' mean up, equal to that of horizontal axes that spread over 6 degrees."""
+_ROUNDS = 10  # rounds of reweighting; this and the others are set by hand
+_ROLL_RAD = 0.05  # roll above which a camera counts less: hand-held cameras are level to about three degrees
+_MEAN_UP_WEIGHT = 0.01  # weight of the images' mean up, equal to that of horizontal axes that spread over 6 degrees
 _GOES_ROUND, _LEVEL = 0.35, 0.1
 """An axis of the images is level, and the cameras go round: least middle eigenvalue of its second moments (a circle has
 a half, an arc of 135 degrees .35), and most that the smallest is of it."""
-_MORE_LEVEL = 0.25
-"""Most that this share is of the other axis's."""
-_LOOKING_DOWN = 0.05
-"""Mean sine of the angle below the horizon at which cameras look from above at what they go round."""
+_MORE_LEVEL = 0.25  # most that this share is of the other axis's
+_LOOKING_DOWN = 0.05  # mean sine of the angle below the horizon at which cameras look from above at what they go round
 _UP_AFTER, _UP_BEFORE = 0.5, 0.3
 """Cosine between up and the up of an image that is turned, and of one that is not, as one that looks straight down."""
-_RESIDUAL_FLOOR = 0.1
-"""Distance of an axis from the focus point, over the median one, below which weights stop growing."""
-_MIN_IN_FRONT = 0.7
-"""Share of the cameras that have the focus point in front of them."""
+_RESIDUAL_FLOOR = 0.1  # distance of an axis from the focus point, over the median one, below which weights stop growing
+_MIN_IN_FRONT = 0.7  # share of the cameras that have the focus point in front of them
 
 
 def estimate_up(cameras: Cameras) -> Float[Tensor, "3"]:

@@ -18,38 +18,30 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.planes import least_squares_normal
 from splatgraft.core.rotations import quaternion_from_rotation
 
-_OPAQUE = 0.1
-"""Opacity above which a Gaussian counts as part of a surface, as for a bounding sphere."""
-_FIT_TOLERANCES = (0.4, 0.25, 0.2)
-"""Object radii; distance from the plane of the Gaussians that each fit takes."""
+_OPAQUE = 0.1  # opacity above which a Gaussian counts as part of a surface, as for a bounding sphere
+_FIT_TOLERANCES = (0.4, 0.25, 0.2)  # object radii; distance from the plane of the Gaussians that each fit takes
 
 # what counts as a contact layer, and how far it is flattened; set by hand on rendered scenes
-_REACH = 0.35
-"""Object radii: the plane is fitted to the target's Gaussians within this distance of the object's."""
-_NEIGHBOURS = 24
-"""Gaussians whose centres and shapes give the normal of one; fewer in all are no contact layer."""
+_REACH = 0.35  # object radii: the plane is fitted to the target's Gaussians within this distance of the object's
+_NEIGHBOURS = 24  # gaussians whose centres and shapes give the normal of one; fewer in all are no contact layer
 _MAX_USED = 2000
 """Gaussians of the target, and of the object, that the fit uses: even ones of the list, where there are more. Twice
 as many show where the scene is level."""
-_MAX_TILT = 0.5
-"""Largest sine of the angle between the plane and the surface at a Gaussian that the plane is fitted to."""
+_MAX_TILT = 0.5  # largest sine of the angle between the plane and the surface at a Gaussian that the plane is fitted to
 _MIN_SHARE = 0.25
 """Smallest share of the surface within reach that lies on the plane; less, as in a bush, is no contact layer."""
-_TOP = 2.0
-"""Standard deviations of the heights from the layer's middle to its top."""
+_TOP = 2.0  # standard deviations of the heights from the layer's middle to its top
 _DEEPEST = 3.0
 """Standard deviations from the middle up to which a Gaussian belongs to the layer; an object whose base is higher
 floats."""
 _LEVEL = 0.5
 """Standard deviations of the heights by which the mean of the Gaussians beside one in the plane may be off the
 middle; where it is off by one more, as at a book or a cup on the table, nothing is flattened."""
-_FOOT = 0.2
-"""Object radii above its base up to which an object is its foot."""
+_FOOT = 0.2  # object radii above its base up to which an object is its foot
 _SLOPE = 0.2
 """Tangent of the elevation, 11 degrees, of the lowest camera from which the whole foot is visible: a flattened layer
 rises from the foot by this slope."""
-_FLATTEST = 0.2
-"""Least factor on heights; measured: a flatter layer covers no less."""
+_FLATTEST = 0.2  # least factor on heights; measured: a flatter layer covers no less
 
 
 @dataclass(frozen=True)

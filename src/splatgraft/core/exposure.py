@@ -9,10 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-_SATURATION_CD_M2 = 78 / (100 * 0.65)
-"""Luminance of white at EV 0 and ISO 100."""
-_EV_OF_BRIGHTNESS_0 = 5.0
-"""APEX: the speed value of ISO 100."""
+_SATURATION_CD_M2 = 78 / (100 * 0.65)  # luminance of white at EV 0 and ISO 100
+_EV_OF_BRIGHTNESS_0 = 5.0  # APEX: the speed value of ISO 100
 _GAMMA = 2.2
 MAX_STOPS = 0.4
 """Between the darkest and the brightest setting of a capture's photos, above which settings count as different: a third

@@ -19,14 +19,10 @@ _PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
 _SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
 """Contrast sensitivity of the achromatic, red-green and blue-yellow channel, as sums of Gaussians (a, b):
 a sqrt(pi / b) exp(-pi^2 x^2 / b), x in degrees (Table 1)."""
-_COLOR_EXPONENT = 0.7
-"""q_c, compresses large colour differences (Sec. 4.1.4)."""
-_KNEE = (0.4, 0.95)
-"""p_c and p_t: differences up to p_c of the largest are spread over [0, p_t] (Sec. 4.1.4)."""
-_FEATURE_WIDTH_DEGREES = 0.082
-"""w, from peak to trough of the edge detector (Sec. 4.2.1)."""
-_FEATURE_EXPONENT = 0.5
-"""q_f (Sec. 4.2.2)."""
+_COLOR_EXPONENT = 0.7  # q_c, compresses large colour differences (Sec. 4.1.4).
+_KNEE = (0.4, 0.95)  # p_c and p_t: differences up to p_c of the largest are spread over [0, p_t] (Sec. 4.1.4).
+_FEATURE_WIDTH_DEGREES = 0.082  # w, from peak to trough of the edge detector (Sec. 4.2.1).
+_FEATURE_EXPONENT = 0.5  # q_f (Sec. 4.2.2).
 VERSION = "LDR-FLIP 2020, own implementation, 67.02 pixels per degree"
 """What a figure of FLIP was computed with."""
 

@@ -25,8 +25,7 @@ WRITTEN_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff",
 _HEIF_SUFFIXES = frozenset({".heic", ".heif"})
 IMAGE_SUFFIXES = WRITTEN_SUFFIXES | _HEIF_SUFFIXES
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
-_TURNED_SIDEWAYS = (5, 6, 7, 8)
-"""EXIF orientations that exchange width and height."""
+_TURNED_SIDEWAYS = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 _FROM_RIGHT, _FROM_BELOW = (2, 3, 7, 8), (3, 4, 6, 7)
 """EXIF orientations of which stored columns and rows are counted from the other side than when shown upright."""
 _ALWAYS_ALLOWED_PIXELS = 1 << 24
@@ -34,8 +33,7 @@ _PIXELS_PER_BYTE = 1 << 14
 """Above every real image: a black 1-bit PNG has 8256. Above 179 million pixels Pillow itself refuses."""
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 """Weights of linear rgb in luminance (Rec. 709)."""
-_MEAN_PX = 256
-"""Longest side from which a mean is taken of a file that can be read smaller than it is."""
+_MEAN_PX = 256  # longest side from which a mean is taken of a file that can be read smaller than it is
 _GREY_SCALES = {"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I;16N": 65535, "I": 65535, "F": 1}
 """White in Pillow's modes of more than 8 bits; some versions read a 16-bit PNG as mode I."""
 

@@ -11,12 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_TRIALS = 2000
-"""Random planes tried."""
-_REFINEMENTS = 3
-"""Least-squares fits, each to the inliers of the one before."""
-_MIN_POINTS = 50
-"""Fewer points give no plane."""
+_TRIALS = 2000  # random planes tried
+_REFINEMENTS = 3  # least-squares fits, each to the inliers of the one before
+_MIN_POINTS = 50  # fewer points give no plane
 
 
 @dataclass(frozen=True)

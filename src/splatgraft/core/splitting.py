@@ -67,16 +67,11 @@ def _pieces_by_opacity(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 6"]:
 
 
 # which Gaussians around an object are split; set by hand on the benchmark scenes
-_MIN_WIDTH = 0.25
-"""Least standard deviation along the widest axis, object radii."""
-_MIN_OPACITY = 0.02
-"""Fainter Gaussians are not split."""
-_REACH = 1.5
-"""Largest distance of a centre from the object's, object radii; two standard deviations are added to it."""
-_FARTHEST = 6.0
-"""Largest distance of a centre in any case, object radii."""
-_ROUNDS = 6
-"""How many times the pieces that are still too wide are split again, at most."""
+_MIN_WIDTH = 0.25  # least standard deviation along the widest axis, object radii
+_MIN_OPACITY = 0.02  # fainter Gaussians are not split
+_REACH = 1.5  # largest distance of a centre from the object's, object radii; two standard deviations are added to it
+_FARTHEST = 6.0  # largest distance of a centre in any case, object radii
+_ROUNDS = 6  # how many times the pieces that are still too wide are split again, at most
 _MAX_PER_ROUND = 4000
 """Most Gaussians split per round and object; a scene of a million small Gaussians has none that wide."""
 

@@ -25,10 +25,8 @@ _CHANGED = 2 / 255
 """sRGB difference with and without the object from which a pixel counts as changed; set by hand, as the next three."""
 _RATIO_OFFSET = 0.002
 """Linear light added to both sides of a ratio: 6/255 in sRGB, below which 8 bits do not resolve a shadow."""
-_OBJECT_MARGIN_PX = 2
-"""Pixels around the object that belong to no region."""
-_REST_MARGIN = 0.01
-"""Margin between changed pixels and the rest, as a share of the image's width; at least 2 pixels."""
+_OBJECT_MARGIN_PX = 2  # pixels around the object that belong to no region
+_REST_MARGIN = 0.01  # margin between changed pixels and the rest, as a share of the image's width; at least 2 pixels
 
 
 @dataclass(frozen=True)
@@ -86,10 +84,8 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 
 SMALLEST_REGION = 25
 """Pixels; smaller regions of a view are left out of the means. Set by hand."""
-_SHOWN = ("copy_paste", "result")
-"""The pictures of a view that are measured."""
-_SSIM_BORDER = 5
-"""Pixels: SSIM's window reaches over the image border there."""
+_SHOWN = ("copy_paste", "result")  # the pictures of a view that are measured
+_SSIM_BORDER = 5  # pixels: SSIM's window reaches over the image border there
 
 
 @dataclass(frozen=True)

@@ -93,10 +93,8 @@ def _animated(frames: Sequence[Image.Image], kind: str, *, duration: int, **sett
 _DARKER = torch.tensor([0.16, 0.32, 0.78])
 _BRIGHTER = torch.tensor([0.93, 0.55, 0.10])
 _UNCHANGED = torch.tensor([0.93, 0.93, 0.93])
-_NOISE_STOPS = 0.02
-"""Photographic stops; smaller changes stay grey in the change map. The noise between two renders."""
-_FULL_COLOR_STOPS = 1.0
-"""Photographic stops at which the change map has its full colours; set by hand."""
+_NOISE_STOPS = 0.02  # photographic stops; smaller changes stay grey in the change map. The noise between two renders.
+_FULL_COLOR_STOPS = 1.0  # photographic stops at which the change map has its full colours; set by hand
 _EXPONENT = 0.7
 """Exponent of the colours of the change map; below 1, so that faint shadows stay visible beside strong ones."""
 

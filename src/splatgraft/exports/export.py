@@ -16,14 +16,11 @@ from splatgraft.formats import WRITTEN_SCENE_SUFFIXES, scene_suffix, write_gauss
 from splatgraft.formats.scenes.spz import write_spz
 from splatgraft.runtime.progress import Progress, silent
 
-_WORLD_SUFFIXES = (".glb", ".usdz")
-"""Formats whose y points up and whose unit is a metre."""
+_WORLD_SUFFIXES = (".glb", ".usdz")  # formats whose y points up and whose unit is a metre
 
 _WIDTH = 1280
-_MIN_WIDTH = 16
-"""Pixels."""
-_PART_BACKGROUND = 0.8
-"""Grey on which a page shows an object or a shadow alone, sRGB."""
+_MIN_WIDTH = 16  # pixels
+_PART_BACKGROUND = 0.8  # grey on which a page shows an object or a shadow alone, sRGB
 
 _PICTURES, _TURNTABLES = (".png", ".jpg"), (".mp4", ".gif", ".webp")
 EXPORT_SUFFIXES = (".html", *WRITTEN_SCENE_SUFFIXES, *_PICTURES, *_TURNTABLES)

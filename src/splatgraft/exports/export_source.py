@@ -21,13 +21,10 @@ _DOWN_Y = (0.0, -1.0, 0.0)
 """Up in the axes of a .ply, whose y points down; formats whose y points up turn it on writing."""
 _FOV_DEG = 45.0
 _ASPECT = 4 / 3
-_DISTANCE = 2.2
-"""From the middle of a scene without cameras, in its radii."""
+_DISTANCE = 2.2  # from the middle of a scene without cameras, in its radii
 _ELEVATION_DEG = 20.0
-_IN_FRONT = 0.5
-"""Cosine of the angle between a camera that may be the first one and the side that was photographed."""
-_CENTRAL = 0.6
-"""Half of the picture's sides within which the object's middle lies in a view that may be the first one."""
+_IN_FRONT = 0.5  # cosine of the angle between a camera that may be the first one and the side that was photographed
+_CENTRAL = 0.6  # half of the picture's sides within which the object's middle lies in a view that may be the first one
 
 Point = tuple[float, float, float]
 

@@ -35,20 +35,17 @@ _POLICY = (
 )
 _LONGEST_PX = 1200
 _QUALITY = 80
-_THUMBNAIL_PX = 240
-"""Twice the width at which the page shows them."""
+_THUMBNAIL_PX = 240  # twice the width at which the page shows them
 _DATA = re.compile(r'(<script type="application/json" id="views">)(.*?)(</script>)', re.DOTALL)
 _LOCAL = re.compile(r'(<(?:img|a)\b[^>]*?\b(?:src|href)=")([^":#]+)(")')
 _NOTE = "The page needs only the files in its folder; it loads nothing from the network."
-_SPLIT = 0.5
-"""Where the divider between two scenes stands at first, share of the width."""
+_SPLIT = 0.5  # where the divider between two scenes stands at first, share of the width
 _WIDEST = 2.0
 """A page narrower than the first view shows the same width, up to this factor of the tangent of its vertical field of
 view."""
 _STILL_ASPECT = 1.2
 """Width over height of the still, whose height is that of the narrowest page: it covers pages of up to 2.4."""
-_STILL_PX = 1600
-"""Width of the still: 1280 pixels of a page 1.6 wide are 1067 of it."""
+_STILL_PX = 1600  # width of the still: 1280 pixels of a page 1.6 wide are 1067 of it
 _STILL_QUALITY = 60
 _NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
 """An empty picture, until the page's script sets the pictures of a view."""

@@ -23,10 +23,8 @@ from splatgraft.runtime.files import atomic_write, writable
 from splatgraft.runtime.progress import Progress, silent
 
 FPS = 24
-_LEAST_BYTES = 1 << 12
-"""No video is smaller; a disk with less room is full."""
-_QUALITY = "19"
-"""Constant rate factor of x264: no loss is seen."""
+_LEAST_BYTES = 1 << 12  # no video is smaller; a disk with less room is full
+_QUALITY = "19"  # constant rate factor of x264: no loss is seen
 
 
 def write_picture(path: Path, gaussians: Gaussians, view: FirstView, *, width: int, with_alpha: bool) -> None:

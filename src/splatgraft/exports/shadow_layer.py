@@ -21,20 +21,13 @@ from splatgraft.runtime.progress import Progress, silent
 _VIEWS = 24
 """Cameras of the target; every fourth one is left out of the fit and measured. All numbers are set by hand, on the
 demo's scenes."""
-_LONGEST_PX = 320
-"""Longer side of the pictures."""
-_STEPS = 240
-"""Steps of Adam, one view each."""
-_LEARNING_RATE = 0.15
-"""Step size for opacity logits; it falls to a tenth."""
-_MIN_GROUND = 0.02
-"""sRGB below which nothing is said about the share of light that is missing."""
-_MIN_SHARE = 0.01
-"""Share of light that a Gaussian must miss to be part of the layer."""
-_MIN_WEIGHT_PX = 0.5
-"""Pixels that a Gaussian must make up in all views together."""
-_MIN_OPACITY = 1 / 255
-"""Opacity below which a Gaussian is left out at the end."""
+_LONGEST_PX = 320  # longer side of the pictures
+_STEPS = 240  # steps of Adam, one view each
+_LEARNING_RATE = 0.15  # step size for opacity logits; it falls to a tenth
+_MIN_GROUND = 0.02  # sRGB below which nothing is said about the share of light that is missing
+_MIN_SHARE = 0.01  # share of light that a Gaussian must miss to be part of the layer
+_MIN_WEIGHT_PX = 0.5  # pixels that a Gaussian must make up in all views together
+_MIN_OPACITY = 1 / 255  # opacity below which a Gaussian is left out at the end
 
 
 @dataclass(frozen=True)

@@ -97,8 +97,7 @@ def step(
 
 _Fields = tuple[Float[Tensor, "n _"], ...]
 _Rates = tuple[Float[Tensor, "_"], ...]
-_Rows = tuple[_Fields, ...]
-"""Values, gradients, first and second moments, each of all fields."""
+_Rows = tuple[_Fields, ...]  # values, gradients, first and second moments, each of all fields
 
 
 def _step_numba(rows: _Rows, steps: Int[Tensor, "n"], rates: _Rates, visible: Bool[Tensor, "n"]) -> bool:

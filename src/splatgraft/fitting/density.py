@@ -22,16 +22,12 @@ from splatgraft.fitting.gaussian_fit import FitState, Step
 from splatgraft.rendering import view_operator
 
 # set by hand where no source is named
-_DEAD_OPACITY = 0.005
-"""Opacity below which a Gaussian is removed (3DGS, Sec. 5)."""
-_SHIFT = 0.5
-"""Distance of the children from the parent's centre, in the parent's longest standard deviation."""
+_DEAD_OPACITY = 0.005  # opacity below which a Gaussian is removed (3DGS, Sec. 5).
+_SHIFT = 0.5  # distance of the children from the parent's centre, in the parent's longest standard deviation
 _LONG_SCALE = math.sqrt(1 - _SHIFT**2)
 """Width of a child along the split axis, over the parent's; keeps the variance: shift^2 + long_scale^2 = 1."""
-_SHORT_SCALE = 0.85
-"""Width of a child across the split axis, over the parent's."""
-_CHILD_OPACITY = 0.6
-"""Opacity of a child over the parent's."""
+_SHORT_SCALE = 0.85  # width of a child across the split axis, over the parent's
+_CHILD_OPACITY = 0.6  # opacity of a child over the parent's
 _MIN_CHILD_OPACITY = 1.2 * _DEAD_OPACITY
 _MAX_SCALE = 0.125
 """Bound on the standard deviation, over the distance to the nearest camera. A larger one beside a view reaches the

@@ -23,11 +23,9 @@ from splatgraft.rendering import Output, RenderOptions, render
 from splatgraft.runtime.process import interruption_held
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
-_REPORT_EVERY = 10
-"""Steps."""
+_REPORT_EVERY = 10  # steps
 _CHECKPOINT_SECONDS = 30.0
-_COPRIME = 3
-"""Step through the cells of a stride: visits go through all of them, for strides of 2 and 4."""
+_COPRIME = 3  # step through the cells of a stride: visits go through all of them, for strides of 2 and 4
 MIN_SIDE_PX = 32
 """Smallest side of an image that is fitted: below it the 11-pixel window of SSIM covers most of the image."""
 

@@ -11,12 +11,9 @@ from splatgraft.formats.captures import find_poses
 from splatgraft.formats.captures.exif import read_exposure
 from splatgraft.runtime.note import Note
 
-_NAMED = 8
-"""Most images that a message names."""
-_PLENTY = 40
-"""Images that are enough whatever is left out."""
-_FEW = 4
-"""Photos kept per photo left out from which on the capture is not in doubt; set by hand."""
+_NAMED = 8  # most images that a message names
+_PLENTY = 40  # images that are enough whatever is left out
+_FEW = 4  # photos kept per photo left out from which on the capture is not in doubt; set by hand
 
 
 def has_poses(path: Path) -> bool:

@@ -22,8 +22,7 @@ from splatgraft.project.layout import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
 from splatgraft.rendering import render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
-_CUT_OBJECT = 0.05
-"""What the coverage of an object counts that the picture's rim cuts; set by hand."""
+_CUT_OBJECT = 0.05  # what the coverage of an object counts that the picture's rim cuts; set by hand
 _GUESSED_POWER = 4
 """Of the share that was photographed: a view that shows a fifth of guesses counts four tenths; set by hand."""
 _LOOK_PX, _LOOKED_AT = 160, 40

@@ -25,8 +25,7 @@ from splatgraft.runtime.workers import Task, run_tasks
 
 _READERS, _WRITERS = 1, 2
 """Threads that decode and encode images beside the model: about 0.09 s a view of 704x496 in one thread."""
-_WAITING_VIEWS = 2
-"""Finished views that may wait to be written."""
+_WAITING_VIEWS = 2  # finished views that may wait to be written
 _POLL_SECONDS = 0.5
 
 

@@ -13,8 +13,7 @@ from splatgraft.formats.captures.photo_archive import count_archived_photos, is_
 from splatgraft.project.layout import PROJECT_FILE, SCENE_FILE
 
 InputKind = Literal["photos", "video", "posed capture", "scene", "project", "nothing"]
-_LARGE = 1 << 30
-"""Bytes above which a scene is not read to count its Gaussians."""
+_LARGE = 1 << 30  # bytes above which a scene is not read to count its Gaussians
 _FOLDERS = (f"target/scene/{SCENE_FILE}", f"result/{SCENE_FILE}", SCENE_FILE)
 """Scenes in folders that splatgraft writes."""
 

@@ -38,8 +38,7 @@ MaskSource = Literal["auto", "files", "grabcut", "sam2", "birefnet", "box"]
 CUT_SIDE_PX = 384
 """Longest side at which pictures are cut: the masks of larger ones are the same within half a pixel of it, and GrabCut
 takes time with the area."""
-_CELL_PX = 320
-"""Longest side of one photograph on the sheet."""
+_CELL_PX = 320  # longest side of one photograph on the sheet
 _COLUMNS = 4
 _MASK_RED, _SELECTION_BLUE = (255, 60, 40), (60, 220, 255)
 

@@ -12,8 +12,7 @@ import numpy as np
 from splatgraft.formats.captures.views import MAX_SIDE
 from splatgraft.runtime.files import atomic_write
 
-_LONGEST = 60
-"""Characters of a value in an error message."""
+_LONGEST = 60  # characters of a value in an error message
 
 
 def load(path: Path) -> Any:

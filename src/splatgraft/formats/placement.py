@@ -24,8 +24,7 @@ from splatgraft.formats.json_file import array, excerpt, load, number, save
 
 _ERASED_FILE = "erased.npy"
 _DEFAULTS = {"object": None, "scale": 1.0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
-_RIGID = 1e-4
-"""Largest entry of R R^T - I; accepts files with six digits, refuses a scale or shear in the matrix."""
+_RIGID = 1e-4  # largest entry of R R^T - I; accepts files with six digits, refuses a scale or shear in the matrix
 
 
 @dataclass(frozen=True)

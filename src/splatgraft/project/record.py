@@ -15,8 +15,7 @@ STEP_FILE = "step.json"
 Entry = tuple[str, int, int, str]
 """Name, size in bytes, modification time in ns, sha256 of one input file."""
 
-_LONGEST_REASON = 100
-"""Characters; what changed is left out where it is longer."""
+_LONGEST_REASON = 100  # characters; what changed is left out where it is longer
 
 
 @dataclass(frozen=True)

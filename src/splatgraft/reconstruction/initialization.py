@@ -19,8 +19,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 
-_CANDIDATES = 200_000
-"""Random points drawn at a time."""
+_CANDIDATES = 200_000  # random points drawn at a time
 
 
 @dataclass(frozen=True)
@@ -140,21 +139,16 @@ def _views_that_see(points: Float[Tensor, "m 3"], cameras: Cameras) -> Float[Ten
 
 
 # set by hand
-_QUANTILE = 0.99
-"""Quantile of the known points' distances from where the cameras look; wrong points lie beyond."""
-_BEYOND = 1.5
-"""Radius of the shell over that distance."""
+_QUANTILE = 0.99  # quantile of the known points' distances from where the cameras look; wrong points lie beyond
+_BEYOND = 1.5  # radius of the shell over that distance
 MIN_RADIUS = 6.0
 """Smallest radius, over the cameras' distance from where they look."""
-_MIN_DIRECTIONS = 64
-"""Directions by which the seen share of the sphere is found."""
-_NEIGHBOURS = 8
-"""Seen points whose mean colour continues beyond them."""
+_MIN_DIRECTIONS = 64  # directions by which the seen share of the sphere is found
+_NEIGHBOURS = 8  # seen points whose mean colour continues beyond them
 _PLAIN_SHARE = 0.05
 """Share of the pixels at the images' edges above which a colour is taken for what was put behind the scene; that of
 black in the bonsai's photos is .01."""
-_PLAIN_TOLERANCE = 2.5 / 255
-"""How far a pixel of that colour may be from it, sRGB."""
+_PLAIN_TOLERANCE = 2.5 / 255  # how far a pixel of that colour may be from it, sRGB
 
 
 def shell_radius(points: Float[Tensor, "m 3"], focus: Float[Tensor, "3"], reach: float) -> float:

@@ -133,23 +133,17 @@ class ReconstructOptions:
         return min(1.0, _PRESETS[self.quality].longest_side_px / longest)
 
 
-_BASE_BYTES = 450 * 2**20
-"""Python, torch and compiled kernels, resident."""
-_COPIES = 6
-"""Copies of every field: value, gradient, two moments, and two while Gaussians are rearranged."""
+_BASE_BYTES = 450 * 2**20  # python, torch and compiled kernels, resident
+_COPIES = 6  # copies of every field: value, gradient, two moments, and two while Gaussians are rearranged
 _BYTES_PER_PIXEL = 160
 """For the largest view while it is rendered and compared: colour, transmittance, loss and their gradients."""
-_BYTES_PER_GAUSSIAN = 1500
-"""Projections, tile lists and their gradients."""
+_BYTES_PER_GAUSSIAN = 1500  # projections, tile lists and their gradients
 
 # CPU seconds of one step; fitted to runs of 1000 to 4000 steps on an AMD EPYC at 3 GHz (docs/results.md)
 _STEP_SECONDS = 6e-3
-_SECONDS_PER_GAUSSIAN = 1.0e-6
-"""Projection, colours, Adam."""
-_SECONDS_PER_PIXEL = 0.3e-6
-"""Blending and loss."""
-_ERROR_SHARE = 0.1
-"""Share of all this that measuring the covered error adds."""
+_SECONDS_PER_GAUSSIAN = 1.0e-6  # projection, colours, Adam
+_SECONDS_PER_PIXEL = 0.3e-6  # blending and loss
+_ERROR_SHARE = 0.1  # share of all this that measuring the covered error adds
 
 
 def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:

@@ -15,27 +15,18 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.reconstruction.initialization import SeedPoints
 
-_CELL_PX = 6
-"""Distance of two rays in the reduced image."""
-_DEPTHS = 32
-"""Hypotheses per ray, evenly spaced in inverse depth."""
+_CELL_PX = 6  # distance of two rays in the reduced image
+_DEPTHS = 32  # hypotheses per ray, evenly spaced in inverse depth
 _COMPARED_VIEWS = 4
-_PATCH_SPACING_PX = 1.5
-"""Distance of the 3x3 pixels of a patch."""
-_MIN_ANGLE_DEG = 2.0
-"""Between the directions of two views to what they look at; less tells nothing about depth."""
-_MIN_COSINE = 0.5
-"""Smallest cosine of the angle between the optical axes of two views that are compared."""
+_PATCH_SPACING_PX = 1.5  # distance of the 3x3 pixels of a patch
+_MIN_ANGLE_DEG = 2.0  # between the directions of two views to what they look at; less tells nothing about depth
+_MIN_COSINE = 0.5  # smallest cosine of the angle between the optical axes of two views that are compared
 NEAR, _FAR = 0.4, 8.0
 """Range of the distance from every camera, over the cameras' mean distance from what they look at."""
-_MIN_KNOWN = 100
-"""Known points from which the nearest depth is taken instead, where it is larger."""
-_KNOWN_QUANTILE = 0.02
-"""Share of the known points that are nearer to a camera; structure from motion has some outliers."""
-_TIE = 0.015
-"""Difference in cost that tells nothing, four grey levels."""
-_MAX_COST = 0.12
-"""Mean absolute difference in sRGB above which a ray gives no point."""
+_MIN_KNOWN = 100  # known points from which the nearest depth is taken instead, where it is larger
+_KNOWN_QUANTILE = 0.02  # share of the known points that are nearer to a camera; structure from motion has some outliers
+_TIE = 0.015  # difference in cost that tells nothing, four grey levels
+_MAX_COST = 0.12  # mean absolute difference in sRGB above which a ray gives no point
 
 
 def sweep(

@@ -33,34 +33,27 @@ from splatgraft.reconstruction.options import ReconstructOptions, require_memory
 from splatgraft.reconstruction.plane_sweep import sweep
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
-_PUBLISHED_ITERATIONS = 30_000
-"""Steps for which the published values hold (3DGS)."""
+_PUBLISHED_ITERATIONS = 30_000  # steps for which the published values hold (3DGS)
 _MANY_POINTS, _MIN_POINTS = 1000, 100
 """Sparse points below which more are found by a plane sweep; points of both kinds below which random ones are taken."""
-_SMALL_SIDE_PX = 160
-"""Longest side of the images of the plane sweep and of the far shell's colours."""
-_SHELL_SHARE = 0.05
-"""Gaussians of the far shell over the budget; set by hand."""
+_SMALL_SIDE_PX = 160  # longest side of the images of the plane sweep and of the far shell's colours
+_SHELL_SHARE = 0.05  # gaussians of the far shell over the budget; set by hand
 _START_SHARE = 0.6
 """Gaussians at the start at most, over the budget; the others come where the density control wants them."""
 _PUBLISHED_OPACITY, _SHORT_RUN_OPACITY = 0.1, 0.5
 """Opacity at the start of a run of the published length or longer (3DGS), and of a shorter run."""
-_BAND_SHARE = 30
-"""All steps over the steps between two bands of colour."""
+_BAND_SHARE = 30  # all steps over the steps between two bands of colour
 _DENSIFY_EVERY, _MIN_DENSIFICATIONS = 100, 20
 """Most steps between two densifications (3DGS), and least number of such intervals in a run."""
 _FULL_AT, _STOP_AT = 0.6, 0.8
 """Shares of the steps after which the budget may be reached, and after which nothing is split or removed."""
-_ERROR_EVERY = 4
-"""Steps between two measurements of the error that each Gaussian covers, where the options ask for it."""
+_ERROR_EVERY = 4  # steps between two measurements of the error that each Gaussian covers, where the options ask for it
 _MEANS_POWER, _MAX_MEANS = 0.5, 4.0
 """Exponent of the published length over the run's, the factor on the rate of the centres, and its bound."""
 _OTHERS_POWER, _MAX_OTHERS = 0.6, 8.0
 """The same for all other rates."""
-_COLOR_RATE = 0.003
-"""Learning rate of each photograph's own affine map of colours."""
-_SHORT_RUN_FINAL = 0.1
-"""Last rate over the first, for all but the centres, in a shorter run."""
+_COLOR_RATE = 0.003  # learning rate of each photograph's own affine map of colours
+_SHORT_RUN_FINAL = 0.1  # last rate over the first, for all but the centres, in a shorter run
 
 
 def reconstruct(

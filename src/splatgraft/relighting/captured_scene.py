@@ -18,10 +18,8 @@ from splatgraft.rendering import Render, render
 
 _VIEWS, _VIEW_PX = 16, 480
 """Cameras, spread over the list, and the longest side of what is drawn in them, pixels; set by hand."""
-_NEAREST = 1e-6
-"""World units in front of a camera; what is nearer is not drawn."""
-_HUGE = 1e6
-"""World units, and units of colour; larger Gaussians are a format's or an optimiser's fault."""
+_NEAREST = 1e-6  # world units in front of a camera; what is nearer is not drawn
+_HUGE = 1e6  # world units, and units of colour; larger Gaussians are a format's or an optimiser's fault
 
 
 @dataclass(frozen=True, eq=False)

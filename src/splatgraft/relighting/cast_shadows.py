@@ -28,8 +28,7 @@ from splatgraft.relighting.shadows.view_fit import fit_to_views
 SHADOW_POWER = 1.3
 """Exponent of shadows under an estimated light whose sun no shadow shows: an average over what is possible has less
 contrast than the light itself. Fitted by benchmarks/fit_shadows.py."""
-_CATCHER_SPACING = 0.05
-"""Object radii between two shadow catchers; set by hand."""
+_CATCHER_SPACING = 0.05  # object radii between two shadow catchers; set by hand
 
 
 @dataclass(frozen=True)

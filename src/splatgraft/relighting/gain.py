@@ -22,10 +22,8 @@ from splatgraft.relighting.shading import apply_gain
 from splatgraft.runtime.note import Note
 
 # set by hand
-_DARKEST = 1e-4
-"""Linear light, a third of one 8-bit step; darker light counts as this."""
-_MAX_LOG_GAIN = math.log(4.0)
-"""Logarithm of the largest factor by which a channel is multiplied or divided."""
+_DARKEST = 1e-4  # linear light, a third of one 8-bit step; darker light counts as this
+_MAX_LOG_GAIN = math.log(4.0)  # logarithm of the largest factor by which a channel is multiplied or divided
 _MAX_LOG_TINT = math.log(1.6)
 """Logarithm of the largest factor between a channel and the mean of the three; more is likely a coloured wall."""
 _TRUSTED_COVERAGE = 0.5

@@ -31,8 +31,7 @@ from splatgraft.relighting.shading import (
 from splatgraft.relighting.shadows.catchers import with_depth
 from splatgraft.runtime.note import Note
 
-_MAX_VIEW_CHANGE = 0.9
-"""Share of the light in a shadow that a view direction takes away; set by hand."""
+_MAX_VIEW_CHANGE = 0.9  # share of the light in a shadow that a view direction takes away; set by hand
 _MIN_SLOPE = 1e-6
 """Smallest slope of a ratio over view directions; below it nothing is seen, and divisions would overflow."""
 _MIN_CERTAIN = 0.5

@@ -87,28 +87,20 @@ def reflected_light(light: Light, samples: LightSamples, visibility: Float[Tenso
     )
 
 
-_CHUNK = 8192
-"""Gaussians at a time; bounds memory."""
-_MAX_FITTED = 8192
-"""Gaussians that lobes are fitted to, spread over the object; more add time and change nothing."""
-_ROUNDS = 15
-"""Rounds of k-means."""
+_CHUNK = 8192  # gaussians at a time; bounds memory
+_MAX_FITTED = 8192  # gaussians that lobes are fitted to, spread over the object; more add time and change nothing
+_ROUNDS = 15  # rounds of k-means
 
 # the model's few numbers; on twelve rendered scenes of given true light the result is flat around all of them
-_CLUSTERS = 6
-"""Clusters of colour and place; 2 to 16 give the same PSNR within 0.02 dB."""
+_CLUSTERS = 6  # clusters of colour and place; 2 to 16 give the same PSNR within 0.02 dB
 _CONCENTRATIONS = (1.5, 3.0, 6.0, 12.0, 25.0)
 """Concentrations of the lobes that are tried, from satin to polished; bands of degree 3 hold no finer ones."""
 _EVIDENCE = 0.05
 """Explained share of the change with the view at which a lobe is believed by half: shares of pure noise."""
-_LOWEST_COSINE = 0.1
-"""Between normal and view; flatter views are left out."""
-_MIN_MATT = 0.2
-"""Share of a Gaussian's colour that stays, whatever the lobe explains."""
-_FACING = 0.04
-"""Reflectance at normal incidence relative to grazing, of a dielectric (Schlick 1994)."""
-_MIRROR = 0.3
-"""Reflectance from which the sharpest lobe is called a mirror."""
+_LOWEST_COSINE = 0.1  # between normal and view; flatter views are left out
+_MIN_MATT = 0.2  # share of a Gaussian's colour that stays, whatever the lobe explains
+_FACING = 0.04  # reflectance at normal incidence relative to grazing, of a dielectric (Schlick 1994)
+_MIRROR = 0.3  # reflectance from which the sharpest lobe is called a mirror
 
 
 @dataclass(frozen=True)
@@ -320,12 +312,9 @@ def _fitted(
     return believed[:, None] * reflectance[best, each], values[best], kinds[best]
 
 
-_GLOSS_CHUNK = 4096
-"""Gaussians at a time; bounds memory."""
-_VIEWS = 64
-"""Directions over the sphere; twice as many as are needed to integrate products of degree 3 without error."""
-_BRIGHTEST = 1.5
-"""Linear; brighter reflections are clipped, which keeps bands from ringing over the whole object."""
+_GLOSS_CHUNK = 4096  # gaussians at a time; bounds memory
+_VIEWS = 64  # directions over the sphere; twice as many as are needed to integrate products of degree 3 without error
+_BRIGHTEST = 1.5  # linear; brighter reflections are clipped, which keeps bands from ringing over the whole object
 
 
 def gloss_bands(

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from splatgraft.runtime.kernels import kernel, serialized
 
-_LEAF = 8
-"""Points per lowest box."""
+_LEAF = 8  # points per lowest box
 
 
 def nearest_neighbours(points: Float[Tensor, "n 3"], *, count: int) -> Int[Tensor, "n k"]:

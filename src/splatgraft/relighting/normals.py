@@ -22,16 +22,12 @@ from splatgraft.rendering import Render, render
 from splatgraft.runtime.kernels import kernel, serialized
 
 # set by hand
-_NEIGHBOURS = 16
-"""Gaussians per mixture."""
+_NEIGHBOURS = 16  # gaussians per mixture
 _CAMERAS, _CAMERA_PX = 8, 128
 """Cameras whose view is tested where none is given, and the longest side of their depth images, pixels."""
-_UNSEEN_CONFIDENCE = 0.5
-"""Factor on the confidence of normals that no tested camera sees."""
-_RAISED = 1.5
-"""Standard deviations along the normal from a Gaussian's centre to where its surface is visible."""
-_OWN_WEIGHT = 0.5
-"""Weight of a Gaussian's own covariance beside the mixture's, both scaled to trace 1."""
+_UNSEEN_CONFIDENCE = 0.5  # factor on the confidence of normals that no tested camera sees
+_RAISED = 1.5  # standard deviations along the normal from a Gaussian's centre to where its surface is visible
+_OWN_WEIGHT = 0.5  # weight of a Gaussian's own covariance beside the mixture's, both scaled to trace 1
 _FLATNESS_GAIN = 2
 """1 - thickness / width, times this, is the confidence: a Gaussian twice as wide as thick is a surface."""
 
@@ -207,12 +203,9 @@ def _smoothed(normals, neighbours):
 
 
 # set by hand
-_SURFACE_ALPHA = 0.5
-"""A pixel of at least this alpha shows a surface."""
-_DEPTH_TOLERANCE = np.float32(0.005)
-"""Share of its depth by which a Gaussian may lie behind the surface."""
-_BEHIND = 2
-"""Standard deviations by which it may lie behind, besides."""
+_SURFACE_ALPHA = 0.5  # A pixel of at least this alpha shows a surface
+_DEPTH_TOLERANCE = np.float32(0.005)  # share of its depth by which a Gaussian may lie behind the surface
+_BEHIND = 2  # standard deviations by which it may lie behind, besides
 
 
 def is_seen(gaussians: Gaussians, camera: Cameras, drawn: Render) -> Bool[Tensor, "n"]:

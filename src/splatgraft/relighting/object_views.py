@@ -20,16 +20,12 @@ from splatgraft.relighting.normals import Normals
 from splatgraft.rendering import ViewOperator, view_operator
 
 # number and size of the views
-_MAX_VIEWS = 16
-"""Cameras, spread over the capture."""
+_MAX_VIEWS = 16  # cameras, spread over the capture
 _PIXELS = 2.0
 """Width of a view in pixels, per square root of the number of Gaussians: a Gaussian in front then covers a few."""
-_MIN_WIDTH = 48
-"""Pixels."""
-_MAX_WIDTH = 128
-"""Pixels; bounds the time."""
-_FILLED = 0.95
-"""Share of the width that the bounding sphere fills."""
+_MIN_WIDTH = 48  # pixels
+_MAX_WIDTH = 128  # pixels; bounds the time
+_FILLED = 0.95  # share of the width that the bounding sphere fills
 
 
 @dataclass(frozen=True)
@@ -89,18 +85,12 @@ def _cut(camera: Cameras, sphere: BoundingSphere, width: int, filled: float) -> 
 _normalize = torch.nn.functional.normalize
 
 # how depth becomes normals; chosen on eight scenes with true normals, flat around these values
-_REACH = 2
-"""Pixels from the middle of the fitted window to its edge; the best of 1, 2, 3."""
-_WINDOW = 1.4
-"""Pixels; standard deviation of the window's weights."""
-_SAME_SURFACE = 0.1
-"""Radii of the object; standard deviation of depth within a window, so that edges are not bridged."""
-_COVERED = 0.5
-"""A pixel of at least this alpha shows the object."""
-_MIN_FILLED = 0.3
-"""Share of the window's weight that must lie on the object."""
-_MIN_PIXELS = 0.5
-"""Pixels that a Gaussian covers in all views together, where depth and neighbours count alike."""
+_REACH = 2  # pixels from the middle of the fitted window to its edge; the best of 1, 2, 3
+_WINDOW = 1.4  # pixels; standard deviation of the window's weights
+_SAME_SURFACE = 0.1  # radii of the object; standard deviation of depth within a window, so that edges are not bridged
+_COVERED = 0.5  # A pixel of at least this alpha shows the object
+_MIN_FILLED = 0.3  # share of the window's weight that must lie on the object
+_MIN_PIXELS = 0.5  # pixels that a Gaussian covers in all views together, where depth and neighbours count alike
 _NEIGHBOURS = 2.0
 """Weight of the neighbours' normal times the third power of its confidence, beside the depth's of 1: on a smooth
 surface more of them average more noise (5.0 degrees instead of 7.5), near edges they mislead."""

@@ -28,8 +28,7 @@ from splatgraft.relighting.shading import irradiance
 from splatgraft.relighting.shadows.scene_ratio import ObjectShadowMaps, object_shadow_maps, self_visibility
 from splatgraft.runtime.note import Note
 
-_MIN_GLOSS = 0.03
-"""Share of the object; less gloss is not reported."""
+_MIN_GLOSS = 0.03  # share of the object; less gloss is not reported
 
 SourceLight = Light | EstimatedLight | NoLight | None
 """The light that an object was captured in: given, estimated, none, or None without a source scene."""

@@ -26,16 +26,12 @@ from splatgraft.runtime.note import Note
 _MAX_DIFFERENCE = 1.5
 """Stops. The mean reflectance of what a capture shows is mostly from 0.1 to 0.5: of two, at most about 2.3 stops apart,
 and seldom more than this."""
-_MAX_LUX = 200_000.0
-"""Sun and clear sky give up to 130,000; the rest is the error of cameras' speeds."""
+_MAX_LUX = 200_000.0  # sun and clear sky give up to 130,000; the rest is the error of cameras' speeds
 
 # pictures
-_HEIGHT = 256
-"""Pixels of the panorama, which is twice as wide."""
-_FACE = 128
-"""Pixels; width of a face of the cube map that is drawn."""
-_UNSEEN = torch.tensor([0.35, 0.35, 0.38])
-"""sRGB that directions without a photograph are mixed with."""
+_HEIGHT = 256  # pixels of the panorama, which is twice as wide
+_FACE = 128  # pixels; width of a face of the cube map that is drawn
+_UNSEEN = torch.tensor([0.35, 0.35, 0.38])  # sRGB that directions without a photograph are mixed with
 _STOPS = 2.0
 """Residual, in stops, of full colour: red where a surface is brighter than explained, blue where it is darker."""
 _RED, _WHITE, _BLUE = torch.tensor([[0.8, 0.1, 0.1], [0.92, 0.92, 0.92], [0.1, 0.25, 0.8]])

@@ -32,24 +32,16 @@ from splatgraft.relighting.shadows.receivers import RIM, Receivers, above_layer,
 from splatgraft.relighting.shadows.scene_ratio import SceneShadowMaps, reachable, scene_shadow_maps, scene_visibility
 
 # the region of the shadow maps; set by hand
-_MARGIN = 1.2
-"""Radius of a new region over what the objects need."""
-_KEPT_RADII = (0.8, 2.0)
-"""Minimum and maximum radius of a region that is kept, over what the objects need."""
-_KEPT_SHIFT = 0.5
-"""Radii of a region by which the objects' place may be off its centre."""
+_MARGIN = 1.2  # radius of a new region over what the objects need
+_KEPT_RADII = (0.8, 2.0)  # minimum and maximum radius of a region that is kept, over what the objects need
+_KEPT_SHIFT = 0.5  # radii of a region by which the objects' place may be off its centre
 
 # when brightness shows whether the main light arrives; set by hand
-_SMOOTHED = 64
-"""Gaussians over which the median is taken."""
-_CONTRAST = 0.5
-"""Irradiance of the light over that of the rest; with less, brightness shows nothing."""
-_FAINTEST = 0.1
-"""Opacity below which a Gaussian is left out."""
-_MIN_GAUSSIANS = 500
-"""With fewer nothing is estimated."""
-_DARKEST = 0.01
-"""sRGB; darker channels count as this."""
+_SMOOTHED = 64  # gaussians over which the median is taken
+_CONTRAST = 0.5  # irradiance of the light over that of the rest; with less, brightness shows nothing
+_FAINTEST = 0.1  # opacity below which a Gaussian is left out
+_MIN_GAUSSIANS = 500  # with fewer nothing is estimated
+_DARKEST = 0.01  # sRGB; darker channels count as this
 _LIT_QUANTILE = 0.75
 """Quantile of apparent albedo in a group of one material: a Gaussian of this brightness is taken to be fully lit."""
 _RAMP_START, _RAMP_WIDTH = 0.2, 0.4

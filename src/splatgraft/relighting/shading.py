@@ -35,8 +35,7 @@ class ShadeSettings:
     violet or blue. Chosen on 19 scenes that the light's numbers were not fitted to: 0 and 0.25 are alike, 1 worse."""
 
 
-_UNKNOWN_SHARE = 0.5
-"""Share of the new light's variation that an object of unknown source light takes on; set by hand."""
+_UNKNOWN_SHARE = 0.5  # share of the new light's variation that an object of unknown source light takes on; set by hand
 KNOWN_LIGHTS = ShadeSettings(level_share=1.0, tint_share=1.0)
 """Where both lights were given: nothing is uncertain."""
 

@@ -11,10 +11,8 @@ from rich.progress import Progress as Bars
 from splatgraft.runtime.note import Note
 from splatgraft.runtime.progress import Progress
 
-_LINES = 10
-"""Lines per counter of a step without a terminal: one per 10%."""
-_LINE_SECONDS = 1.0
-"""Least time between two of these lines; a step of a second needs none."""
+_LINES = 10  # lines per counter of a step without a terminal: one per 10%
+_LINE_SECONDS = 1.0  # least time between two of these lines; a step of a second needs none
 
 
 class Console:

@@ -15,8 +15,7 @@ T = TypeVar("T")
 
 MAX_TEXT_BYTES = 16 << 20
 """Largest settings file that is read; a larger one is another file under that name."""
-_LARGEST_INT = 2**63
-"""TOML's integers have 64 bits."""
+_LARGEST_INT = 2**63  # TOML's integers have 64 bits
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from typing import Any
 
 from splatgraft.runtime.progress import Progress, silent
 
-_RETRIES = 5
-"""How often Ray repeats a task whose worker died."""
+_RETRIES = 5  # how often Ray repeats a task whose worker died
 
 
 @dataclass(frozen=True)

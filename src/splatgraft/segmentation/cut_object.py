@@ -22,12 +22,9 @@ MIN_AGREEMENT = 0.7
 that misses by 2% of the object's diameter all around gives 0.92; thin parts in a short reconstruction give 0.8."""
 _MIN_VIEW_AGREEMENT = 0.5
 """IoU below which the mask of one picture is doubtful: it has less in common with the object than not."""
-_MIN_PIXELS = 12
-"""Pixels of the selection below which a picture does not show the object."""
-_ROUNDS = 2
-"""Most rounds before the last, which cuts every picture; set by hand."""
-_VOTING = 32
-"""Most pictures, evenly spaced, that are cut in the rounds before the last; set by hand."""
+_MIN_PIXELS = 12  # pixels of the selection below which a picture does not show the object
+_ROUNDS = 2  # most rounds before the last, which cuts every picture; set by hand
+_VOTING = 32  # most pictures, evenly spaced, that are cut in the rounds before the last; set by hand
 _SETTLED = 0.97
 """Mean IoU of the masks with those of the round before from which another round would change nothing that shows."""
 

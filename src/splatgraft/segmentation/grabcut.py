@@ -13,22 +13,15 @@ from torch import Tensor
 
 from splatgraft.core.prompts import ViewPrompt
 
-_ITERATIONS = 2
-"""GrabCut iterations per picture."""
-_LIGHTNESS = 0.5
-"""Weight of lightness against colour: below 1, a shadow looks more like the ground on which it lies."""
-_CERTAIN = 0.95
-"""Lifted share from which a pixel is certainly object; below one minus this it is certainly background."""
+_ITERATIONS = 2  # grabCut iterations per picture
+_LIGHTNESS = 0.5  # weight of lightness against colour: below 1, a shadow looks more like the ground on which it lies
+_CERTAIN = 0.95  # lifted share from which a pixel is certainly object; below one minus this it is certainly background
 _BAND = 0.06
 """Half width of the band along the outline in which colour decides, over the square root of the mask's area."""
-_WINDOW = 0.5
-"""Margin around the object that is looked at, over the larger side of its bounding box."""
-_CLICK_PX = 3
-"""Radius of the disc around a point that the user gave, pixels."""
-_SPECK = 50
-"""The largest part of the mask over the largest part that is removed, by area."""
-_HOLE = 1000
-"""The mask over the largest hole that is filled, by area."""
+_WINDOW = 0.5  # margin around the object that is looked at, over the larger side of its bounding box
+_CLICK_PX = 3  # radius of the disc around a point that the user gave, pixels
+_SPECK = 50  # the largest part of the mask over the largest part that is removed, by area
+_HOLE = 1000  # the mask over the largest hole that is filled, by area
 
 
 def grabcut_mask(

@@ -18,8 +18,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import RenderOptions, ViewOperator, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
-_SEEN = 1e-3
-"""Sum of blending weights over all pixels of all views, pixels, above which a Gaussian counts as seen."""
+_SEEN = 1e-3  # sum of blending weights over all pixels of all views, pixels, above which a Gaussian counts as seen
 
 
 @dataclass(frozen=True)

@@ -29,51 +29,34 @@ from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.rendering import surface_points
 from splatgraft.segmentation.selection import Box
 
-_WHOLE_VIEWS = 0.75
-"""Share of the images that show the sphere around the middle whole."""
-_FAR_RADIUS = 0.25
-"""Radius of that sphere over the median distance of the cameras, where they show none whole."""
+_WHOLE_VIEWS = 0.75  # share of the images that show the sphere around the middle whole
+_FAR_RADIUS = 0.25  # radius of that sphere over the median distance of the cameras, where they show none whole
 _SUPPORT = LevelPlaneOptions(thickness=0.03, inlier_share=0.12)
 """Plane near the middle: noise of a reconstruction over the distances of a table instead of a room."""
 _WALL = replace(_SUPPORT, tilt_deg=60.0)
 """A plane whose normal is at most this far from the mean direction to the cameras."""
-_CAMERAS_IN_FRONT = 0.95
-"""Least share of the cameras in front of the support."""
-_ABOVE_SUPPORT = 1.5
-"""Least height of a point above the support, over the support's thickness."""
+_CAMERAS_IN_FRONT = 0.95  # least share of the cameras in front of the support
+_ABOVE_SUPPORT = 1.5  # least height of a point above the support, over the support's thickness
 _NEAR_SUPPORT = -3.0
 """Height over the support's thickness from which the pictures decide whether a point is the object's: a support that is
 found too high takes no foot."""
-_MIN_POINTS = 20
-"""Fewer points give a cube around the middle."""
-_CUBE = 0.5
-"""Half the edge of that cube, over the sphere's radius."""
+_MIN_POINTS = 20  # fewer points give a cube around the middle
+_CUBE = 0.5  # half the edge of that cube, over the sphere's radius
 _SPHERES = (1.0, 1.5, 2.0, 3.0)
 """Radii in which the group is looked for, over that of the sphere, until one holds all of it."""
-_RIM = 0.05
-"""Outermost part of a sphere whose points may go on beyond it, over its radius."""
-_GROUP_STEP = 0.15
-"""Largest distance between neighbours of one group of points, over the sphere's radius."""
-_MAX_POINTS = 20_000
-"""Points that are grouped; of more, as many are drawn."""
-_TRIM = 0.01
-"""Share of points beyond either end of the box along each axis."""
-_MARGIN = 0.2
-"""Added at each end, over the longest edge: parts without texture have no points."""
-_REACH = 0.1
-"""Largest distance of a Gaussian of the object from the group of points, over the box's longest edge."""
-_BEYOND = 1.2
-"""Edges of the box that nothing of the object lies beyond, over those of the box."""
-_LEVEL_NORMAL_Z = 0.99
-"""Least z of the support's normal at which the box ends above the support."""
-_MIN_OPACITY = 0.3
-"""Opacity above which a Gaussian is a surface point."""
+_RIM = 0.05  # outermost part of a sphere whose points may go on beyond it, over its radius
+_GROUP_STEP = 0.15  # largest distance between neighbours of one group of points, over the sphere's radius
+_MAX_POINTS = 20_000  # points that are grouped; of more, as many are drawn
+_TRIM = 0.01  # share of points beyond either end of the box along each axis
+_MARGIN = 0.2  # added at each end, over the longest edge: parts without texture have no points
+_REACH = 0.1  # largest distance of a Gaussian of the object from the group of points, over the box's longest edge
+_BEYOND = 1.2  # edges of the box that nothing of the object lies beyond, over those of the box
+_LEVEL_NORMAL_Z = 0.99  # least z of the support's normal at which the box ends above the support
+_MIN_OPACITY = 0.3  # opacity above which a Gaussian is a surface point
 _COLOR_STEP = 2.0
 """Difference of colour at which a way is twice as long, over the median one of neighbours: texture and noise."""
-_NEIGHBOURS = 10
-"""Nearest Gaussians to which a way leads."""
-_TOUCHED = 6
-"""Gaussians nearest to a point that the user gave which have its side for certain."""
+_NEIGHBOURS = 10  # nearest Gaussians to which a way leads
+_TOUCHED = 6  # gaussians nearest to a point that the user gave which have its side for certain
 
 
 @dataclass(frozen=True)

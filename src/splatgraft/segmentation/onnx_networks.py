@@ -30,10 +30,8 @@ _BIREFNET_SIDE = 1024
 """Width and height, pixels, at which BiRefNet was trained; taken where the network leaves its side free."""
 _SAM2_FEATURES = ("image_embed", "high_res_feats_0", "high_res_feats_1")
 _SAM2_PROMPTS = ("point_coords", "point_labels", "mask_input", "has_mask_input")
-_SAM2_MASK_STRIDE = 4
-"""Side of the encoder's picture over that of `mask_input`."""
-_SAM2_MARGIN = 0.05
-"""Added around the box of the 3D selection at each side, over its width and height; set by hand."""
+_SAM2_MASK_STRIDE = 4  # side of the encoder's picture over that of `mask_input`
+_SAM2_MARGIN = 0.05  # added around the box of the 3D selection at each side, over its width and height; set by hand
 _IMAGENET_MEAN = torch.tensor([0.485, 0.456, 0.406])
 _IMAGENET_STD = torch.tensor([0.229, 0.224, 0.225])
 """Mean and deviation of sRGB in [0, 1] with which the networks were trained."""

@@ -15,10 +15,8 @@ from splatgraft.core.gaussians import Gaussians
 
 Keep = Literal["substantial", "largest", "all"]
 
-_SUBSTANTIAL = 0.05
-"""Least summed opacity of a substantial component over the largest one's; set by hand."""
-_NEIGHBOURS = 16
-"""Nearest Gaussians that are tested for contact with each Gaussian."""
+_SUBSTANTIAL = 0.05  # least summed opacity of a substantial component over the largest one's; set by hand
+_NEIGHBOURS = 16  # nearest Gaussians that are tested for contact with each Gaussian
 
 
 @dataclass(frozen=True)

@@ -24,19 +24,15 @@ from splatgraft.fitting.surface_loss import SurfaceLoss
 from splatgraft.rendering import RenderOptions, render, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
-_DENSIFICATIONS = 20
-"""Intervals between which Gaussians are split."""
+_DENSIFICATIONS = 20  # intervals between which Gaussians are split
 _FULL_AT, _STOP_AT = 0.6, 0.7
 """Shares of the steps after which the wanted number may be reached, and after which nothing is split or removed."""
-_ERROR_EVERY = 4
-"""Steps between two measurements of the error that each Gaussian covers."""
-_STRIDE = 2
-"""Every how many pixels along each axis a step fits."""
+_ERROR_EVERY = 4  # steps between two measurements of the error that each Gaussian covers
+_STRIDE = 2  # every how many pixels along each axis a step fits
 _HIDDEN = 0.1
 """Pixels in which a Gaussian shows, over the square of its width, below which its colour is not known; over the median
 one."""
-_NEIGHBOURS = 8
-"""Gaussians of known colour whose mean is taken then."""
+_NEIGHBOURS = 8  # gaussians of known colour whose mean is taken then
 _RATES = LearningRates(
     means=1.6e-3,
     means_final=1.6e-5,
@@ -49,10 +45,8 @@ _RATES = LearningRates(
     final=0.1,
 )
 """Learning rates; those of the centres over the object's radius."""
-_OCCLUDER_DISTANCE = 0.25
-"""Distance in front of the object, over its extent, from which something else occludes it."""
-_MARGIN_PX = 12
-"""Border of the image windows around the object."""
+_OCCLUDER_DISTANCE = 0.25  # distance in front of the object, over its extent, from which something else occludes it
+_MARGIN_PX = 12  # border of the image windows around the object
 
 
 @dataclass(frozen=True)

@@ -24,45 +24,27 @@ from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_qu
 from splatgraft.rendering import RenderOptions, view_operator
 
 # all set by hand
-_GRID = 96
-"""Voxels along each axis."""
-_ROOM = 1.0
-"""Room around the object's Gaussians in which its unseen side may lie, over their extent."""
-_TRIMMED = 0.005
-"""Share of the Gaussians beyond either end of that extent."""
-_AGREEING = 0.94
-"""Share of the masks inside of which a voxel of the hull must lie: one of sixteen may be wrong."""
-_SHOWN = 0.25
-"""Share of the masks that must show a voxel of the hull: close-ups show parts."""
-_PIECE = 0.02
-"""Share of the object's surface that a piece of the hull must hold: others are only where few masks reach."""
-_FACING = 0.2
-"""Cosine between a surface's normal and a camera, below which the camera does not see it."""
-_MAX_VIEWS = 40
-"""Photographs that are asked, spread over the list."""
-_BIAS = 2.5
-"""Voxels from which on the hull hides a point of its surface."""
-_OPAQUE = 0.3
-"""Opacity from which a Gaussian is a surface, and has a colour to continue."""
-_INSET = 2.0
-"""Voxels by which they lie inside of the hull: it is wider than the object where no camera saw its outline."""
-_OVERLAP = 4.0
-"""Voxels by which they reach under what was seen, so that no gap shows between."""
-_HIDDEN = 0.005
-"""Share of a Gaussian's area that may show in a photograph."""
-_RIM_PX = 1
-"""Pixels of a mask's rim in which none of them may lie."""
+_GRID = 96  # voxels along each axis
+_ROOM = 1.0  # room around the object's Gaussians in which its unseen side may lie, over their extent
+_TRIMMED = 0.005  # share of the Gaussians beyond either end of that extent
+_AGREEING = 0.94  # share of the masks inside of which a voxel of the hull must lie: one of sixteen may be wrong
+_SHOWN = 0.25  # share of the masks that must show a voxel of the hull: close-ups show parts
+_PIECE = 0.02  # share of the object's surface that a piece of the hull must hold: others are only where few masks reach
+_FACING = 0.2  # cosine between a surface's normal and a camera, below which the camera does not see it
+_MAX_VIEWS = 40  # photographs that are asked, spread over the list
+_BIAS = 2.5  # voxels from which on the hull hides a point of its surface
+_OPAQUE = 0.3  # opacity from which a Gaussian is a surface, and has a colour to continue
+_INSET = 2.0  # voxels by which they lie inside of the hull: it is wider than the object where no camera saw its outline
+_OVERLAP = 4.0  # voxels by which they reach under what was seen, so that no gap shows between
+_HIDDEN = 0.005  # share of a Gaussian's area that may show in a photograph
+_RIM_PX = 1  # pixels of a mask's rim in which none of them may lie
 _WIDTH, _THICKNESS = 0.7, 0.15
 """Standard deviations of the Gaussians, over a voxel's side."""
-_LOGIT = 4.0
-"""Opacity .98."""
-_UNDERSIDE = -0.3
-"""Height of a normal below which a surface belongs to the underside, which nobody photographs."""
+_LOGIT = 4.0  # opacity .98
+_UNDERSIDE = -0.3  # height of a normal below which a surface belongs to the underside, which nobody photographs
 _NEIGHBOURS = 8
-_ROUNDS = 400
-"""Steps of Jacobi's method; a step carries colours one neighbour further."""
-_LEAST = 0.02
-"""Share of the surface below which an object counts as seen from all sides."""
+_ROUNDS = 400  # steps of Jacobi's method; a step carries colours one neighbour further
+_LEAST = 0.02  # share of the surface below which an object counts as seen from all sides
 WIDE_GAP_DEG = 60.0
 """Turn without photographs from which it is named."""
 

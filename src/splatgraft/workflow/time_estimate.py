@@ -38,15 +38,13 @@ _TYPICAL_SECONDS = {
 """Seconds in a first `splatgraft demo` on two cores, compilation of kernels included.
 
 Another project differs by a factor, which its finished steps give."""
-_SECONDS_PER_CUT = 1.2
-"""Of each photo whose mask has to be cut."""
+_SECONDS_PER_CUT = 1.2  # of each photo whose mask has to be cut
 _SECONDS_PER_OBJECT_PIXEL = 7e-8
 """Of each step that fits the object, and each pixel of a photo; half for a small object, twice for one that
 fills it."""
 _SECONDS_PER_VIEW, _SECONDS_PER_MEGAPIXEL = 0.12, 0.2
 """Of each picture of the place that is rendered."""
-_FACTOR = 2.0
-"""Largest factor by which finished steps correct the typical times, and its inverse the least."""
+_FACTOR = 2.0  # largest factor by which finished steps correct the typical times, and its inverse the least
 _COMPILATION_SECONDS = 25.0
 """Seconds that compiling the kernels takes in a first reconstruction, a part of its typical time."""
 

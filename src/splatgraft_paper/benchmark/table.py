@@ -10,8 +10,7 @@ import numpy as np
 
 from splatgraft_paper.benchmark.measure import REGIONS
 
-_RESAMPLES = 10_000
-"""Resamples of the bootstrap."""
+_RESAMPLES = 10_000  # resamples of the bootstrap
 _FORMATS = {"psnr": "{:.2f}", "ssim": "{:.4f}", "flip": "{:.4f}", "lpips": "{:.4f}", "fid": "{:.1f}", "kid": "{:.4f}"}
 _METRICS = ("psnr", "ssim", "flip", "lpips", "fid", "kid")
 _LESS_IS_BETTER = (

@@ -29,8 +29,7 @@ _DEGREE = 2
 # limits of the ratio, set by hand; the publication's are not stated
 _FLOOR = 0.05
 """Share of the mean irradiance below which neither irradiance counts: expansions may be near 0 or negative."""
-_MAX_RATIO = 10.0
-"""Factor by which a channel is multiplied or divided."""
+_MAX_RATIO = 10.0  # factor by which a channel is multiplied or divided
 
 
 def relight_by_irradiance_ratio(

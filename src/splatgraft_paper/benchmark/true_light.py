@@ -23,31 +23,21 @@ from splatgraft.relighting.light.panorama import Panorama, cube_directions
 TRUE_LIGHT_FILE = "true_light.json"
 
 # which patches of a panorama without peaks are sources; set by hand
-_CLIPPED = 0.97
-"""sRGB of the brightest channel of a patch."""
-_BRIGHTEST_MEAN = 0.85
-"""sRGB that the mean of the three channels exceeds, besides: saturated colours are no light."""
-_SMALLEST = 2e-4
-"""Steradians; a smaller patch is a highlight."""
-_LARGEST = 0.6
-"""Steradians; a larger patch is sky and stays ambient."""
+_CLIPPED = 0.97  # sRGB of the brightest channel of a patch
+_BRIGHTEST_MEAN = 0.85  # sRGB that the mean of the three channels exceeds, besides: saturated colours are no light
+_SMALLEST = 2e-4  # steradians; a smaller patch is a highlight
+_LARGEST = 0.6  # steradians; a larger patch is sky and stays ambient
 _MAX_PATCHES = 4
-_JOINED_PX = 2.0
-"""Pixels between patches that are joined."""
-_MAX_JOINED = 32
-"""Patches that are joined at all, the largest ones."""
-_WIDEST = math.radians(15)
-"""Radians, half the extent; longer patches are cut in half."""
-_CUTS = 2
-"""Cuts of a patch, one after another."""
+_JOINED_PX = 2.0  # pixels between patches that are joined
+_MAX_JOINED = 32  # patches that are joined at all, the largest ones
+_WIDEST = math.radians(15)  # radians, half the extent; longer patches are cut in half
+_CUTS = 2  # cuts of a patch, one after another
 
-_FACE = 64
-"""Pixels; width of a face of the cube map."""
+_FACE = 64  # pixels; width of a face of the cube map
 _PEAK_OVER_MEAN, _PEAK_AROUND = 50.0, 5.0
 """Times the mean gray radiance: a pixel above the first makes a peak, and near it pixels above the second belong to it.
 Set by hand: suns and lamps of environment maps are 100 to 1000 times the mean; windows of rooms stay below."""
-_PEAK_NEAR_DEG = 15.0
-"""Degrees from the brightest pixel to what belongs to its peak."""
+_PEAK_NEAR_DEG = 15.0  # degrees from the brightest pixel to what belongs to its peak
 _MAX_PEAKS = 6
 
 

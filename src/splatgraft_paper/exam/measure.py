@@ -107,8 +107,7 @@ LIGHT_ROW = "transfer"
 METRICS = {"object": "psnr_object", "whole": "psnr_whole", "shadow": "shadow_ratio_rmse"}
 """Values of a row, and their names in `measure_view`: PSNR in dB twice, and the error of the shadow's strength."""
 _PICTURED = ("paste", "transfer", "true-lights-and-normals")
-_OPAQUE = 0.3
-"""Opacity above which the normal of a Gaussian is measured."""
+_OPAQUE = 0.3  # opacity above which the normal of a Gaussian is measured
 
 
 @dataclass(frozen=True)
@@ -187,12 +186,9 @@ def _measure_estimates(scene: ExamScene, relit: Relit) -> tuple[dict[str, dict[s
     return light, median_angle_deg(found.normals.vectors, scene.normals @ rotation.T, opaque_and_seen)
 
 
-_NORMALS = 200
-"""Even directions over which errors of irradiance are averaged."""
-_FINE_NORMALS = 10_000
-"""Even directions among which the one of most irradiance is looked for; 2 degrees apart."""
-_DARKEST = 1e-6
-"""Linear irradiance; less counts as this."""
+_NORMALS = 200  # even directions over which errors of irradiance are averaged
+_FINE_NORMALS = 10_000  # even directions among which the one of most irradiance is looked for; 2 degrees apart
+_DARKEST = 1e-6  # linear irradiance; less counts as this
 
 LIGHT_ERRORS = ("rms", "level", "tint", "direction_deg")
 

@@ -34,10 +34,8 @@ from splatgraft_paper.synthesis.benchmark import BenchmarkScene, BenchmarkSize, 
 from splatgraft_paper.synthesis.jobs import RenderSize, render_job
 from splatgraft_paper.synthesis.places import KINDS
 
-_CELLS = 80
-"""Width of the image in whose cells surface points are compared; the object takes up half of it or less."""
-_BEHIND = 0.05
-"""Share of the object's size by which a point may lie behind the nearest one and still count as seen."""
+_CELLS = 80  # width of the image in whose cells surface points are compared; the object takes up half of it or less
+_BEHIND = 0.05  # share of the object's size by which a point may lie behind the nearest one and still count as seen
 TRAINING_NUMBER = 0
 """Its scenes are for development; every other number is used for one exam only."""
 SIZE = BenchmarkSize(RenderSize(width=288, height=204, samples=8), views=18)

@@ -28,8 +28,7 @@ from splatgraft.rendering import render
 from splatgraft_paper.benchmark.true_light import sample_panorama
 
 _FIRST_STRENGTH = 1e-3
-_PUBLISHED_STEPS = 27_000
-"""After the first stage, which fits no reflections."""
+_PUBLISHED_STEPS = 27_000  # after the first stage, which fits no reflections
 _RATES = {"strength": 0.006, "environment": 0.05, "sh": 0.0025, "opacity_logits": 0.05, "log_scales": 0.005}
 _RATES |= {"quaternions": 0.001}
 """Published learning rates; the centres stay, as they have converged."""
@@ -38,12 +37,10 @@ _SHORT_POWER, _SHORT_MOST = 0.6, 8.0
 """Exponent of the published steps over ours, the factor on all rates but the environment's, and its bound."""
 _PROPAGATE_EVERY, _PROPAGATE_UNTIL = 1_000, 0.8
 """Steps at the published rates between two propagations of normals, and the share of all after which there are none."""
-_REFLECTS = 0.02
-"""Strength above which a Gaussian counts as reflective when normals are propagated."""
+_REFLECTS = 0.02  # strength above which a Gaussian counts as reflective when normals are propagated
 _WIDER, _OPAQUE = 1.5, 0.9
 """Factor on the two longer axes of reflective Gaussians, and least opacity of all, at each propagation."""
-_SABOTAGE = 0.4
-"""Largest change of the others' band 0: their colours are spoilt so that they may turn to reflecting."""
+_SABOTAGE = 0.4  # largest change of the others' band 0: their colours are spoilt so that they may turn to reflecting
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ _LAB_FROM_LOG_LMS = torch.diag(torch.tensor([3.0, 6.0, 2.0]).rsqrt()) @ torch.te
 )
 _DARKEST = 3e-4
 """Linear light to which smaller values are raised: 1/255 in sRGB; below, the logarithm amplifies quantisation."""
-_FLAT_DEVIATION = 1e-4
-"""Deviation in l-alpha-beta below which a channel of the object is shifted but not scaled."""
+_FLAT_DEVIATION = 1e-4  # deviation in l-alpha-beta below which a channel of the object is shifted but not scaled
 _RING_WIDTH, _MIN_RING_PX = 0.5, 3
 """Width of the ring around the object, as a share of the root of the object's area, and at least in pixels."""
 

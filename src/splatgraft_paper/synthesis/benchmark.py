@@ -31,10 +31,8 @@ from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Ta
 from splatgraft_paper.synthesis.places import SUPPLIED_MAPS, make_scene
 from splatgraft_paper.synthesis.scene import Material, Part, Place, Scene, World, add, capture_cameras
 
-_OBJECT_POINTS = 40_000
-"""Sampled points on the object, from which its true normals follow."""
-_SURFACE_RADIUS = 8.0
-"""Metres around the object's middle within which its surface is sampled: all of it."""
+_OBJECT_POINTS = 40_000  # sampled points on the object, from which its true normals follow
+_SURFACE_RADIUS = 8.0  # metres around the object's middle within which its surface is sampled: all of it
 POSES_DEG = (0.0, 120.0, 240.0)
 """P0, P1, P2: the object's rotations in the illumination-consistency scenes (paper, Table 2)."""
 

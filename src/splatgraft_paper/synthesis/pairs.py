@@ -40,10 +40,8 @@ PAPER_SCENES, PAPER_LIGHTS = 190, 27
 """With two objects a scene: the paper's 1,900 targets and a little over its 51,000 composites."""
 _SECONDS_PER_SAMPLE = 7.5e-6
 """CPU seconds of a path of a furnished room: 336 for 704x496 pixels with 128 samples on an AMD EPYC."""
-_ALONE_SHARE = 0.1
-"""Time of an object alone over that of its scene."""
-_SURFACE_RADIUS = 8.0
-"""Metres around the object within which surface points are sampled."""
+_ALONE_SHARE = 0.1  # time of an object alone over that of its scene
+_SURFACE_RADIUS = 8.0  # metres around the object within which surface points are sampled
 
 
 @dataclass(frozen=True)

@@ -160,8 +160,7 @@ def direction(azimuth: Number, elevation: Number) -> Vector:
 
 ARC_LENGTH = 5
 """Views per camera arc (paper, Sec. 5.2)."""
-_OBSTACLE_MARGIN = 0.12
-"""Metres between cameras and obstacles."""
+_OBSTACLE_MARGIN = 0.12  # metres between cameras and obstacles
 _ARC_TRIES, _CAPTURE_TRIES = 400, 40
 """Random draws of an arc, and per camera of a capture."""
 

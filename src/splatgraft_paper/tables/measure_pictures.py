@@ -24,8 +24,7 @@ from splatgraft_paper.tables.layout import held_out_stems, match_views, pictures
 Size = tuple[int, int]
 
 
-_SSIM_BORDER = 5
-"""Pixels of SSIM's window beyond its centre."""
+_SSIM_BORDER = 5  # pixels of SSIM's window beyond its centre
 
 
 @dataclass(frozen=True)

@@ -25,16 +25,14 @@ _FORMATS = {"psnr": "{:.2f}", "fid": "{:.2f}", "minutes": "{:.2f}", "ssim": "{:.
 _LESS_IS_BETTER = ("lpips", "fid", "kid", "flip", "minutes")
 _KEYS = {"psnr": "psnr_whole", "ssim": "ssim_padded_whole", "lpips": "lpips_whole", "flip": "flip_whole"}
 _COLUMNS = ("psnr", "ssim", "lpips", "fid", "kid", "flip")
-_EMPTY = "–"
-"""A cell without a number; the notes say why."""
+_EMPTY = "–"  # A cell without a number; the notes say why
 _FIGURES: dict[Kind, tuple[str, ...]] = {
     "synthetic": ("composite", "GS-IR", "GShader", "3DGS-DR", "Ours", "truth"),
     "real": ("background", "composite", "GS-IR", "GShader", "3DGS-DR", "Ours"),
     "rotation": ("composite", "Ours", "truth"),
 }
 """Columns of the paper's figures of 3D results; our methods come before the last."""
-_ROW_HEIGHT = 200
-"""Pixels of a picture in a figure."""
+_ROW_HEIGHT = 200  # pixels of a picture in a figure
 
 
 def write_paper_report(out: Path, results: PaperResults) -> Path:

@@ -34,8 +34,7 @@ from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 Times = Literal["uniform", "schnell"]
 TINY = "tiny"
 """In place of a base model: one of three million weights is made first, in OUT/base."""
-_BASE_PICTURES = 1200
-"""Most pictures that the tiny base model's autoencoder is trained on."""
+_BASE_PICTURES = 1200  # most pictures that the tiny base model's autoencoder is trained on
 _LORA_TARGETS = (
     r"(single_)?transformer_blocks\..*"
     r"\.(to_[qkv]|to_out\.0|add_[qkv]_proj|to_add_out|proj_mlp|proj_out|ff(_context)?\.net\.(0\.proj|2))"

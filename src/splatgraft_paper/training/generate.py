@@ -161,8 +161,7 @@ class RelightingOptions:
         return Lighting(renderer, maps, self.each, seed)
 
 
-_PIPELINE_BYTES = 36 << 30
-"""GPU memory of bf16 FLUX with both text encoders and its activations. An estimate."""
+_PIPELINE_BYTES = 36 << 30  # GPU memory of bf16 FLUX with both text encoders and its activations. An estimate.
 
 
 def text_to_image_pipeline(base: str) -> Any:

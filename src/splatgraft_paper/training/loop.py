@@ -49,13 +49,10 @@ from splatgraft.runtime.progress import Progress
 LOG_FILE = "log.jsonl"
 STATES = "states"
 _JOB_FILE = "job.json"
-_KEPT_STATES = 2
-"""One more than needed, so that a damaged file does not end a training."""
+_KEPT_STATES = 2  # one more than needed, so that a damaged file does not end a training
 _BROKEN_STATE = (CheckpointException, OSError, RuntimeError, ValueError, KeyError, EOFError, pickle.UnpicklingError)
-_STEPS_AHEAD = 4
-"""Steps whose items are read while the network computes."""
-_SMOOTHING_STEPS = 50
-"""Steps over which the loss that is shown is averaged."""
+_STEPS_AHEAD = 4  # steps whose items are read while the network computes
+_SMOOTHING_STEPS = 50  # steps over which the loss that is shown is averaged
 _STOP, _UNREADABLE = 1, 2
 
 

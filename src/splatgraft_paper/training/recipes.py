@@ -18,8 +18,7 @@ _REMOVAL_SECONDS_PER_PAIR = 0.08
 """Stable Diffusion 2 at 704x496: 4 x 1.1 TFLOP at the 52 TFLOP/s that the paper's harmoniser reaches by the number
 above. An estimate; the paper gives no time."""
 _PAPER_PIXELS = 704 * 496
-_LATENT_BYTES_PER_PIXEL = 16 / 64 * 2
-"""16 channels of bfloat16 for 8 x 8 pixels."""
+_LATENT_BYTES_PER_PIXEL = 16 / 64 * 2  # 16 channels of bfloat16 for 8 x 8 pixels
 
 
 @dataclass(frozen=True)

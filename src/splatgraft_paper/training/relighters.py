@@ -52,8 +52,7 @@ class StandInRelighter:
 
 _WORKER = Path(__file__).with_name("renderer_worker.py")
 _INVERSE, _FORWARD = "inference_svd_rgbx.py", "inference_svd_xrgb.py"
-_MULTIPLE = 64
-"""Pixels: sides of the pictures that the models take."""
+_MULTIPLE = 64  # pixels: sides of the pictures that the models take
 
 
 def inverse_arguments(given: Path, out: Path, size: tuple[int, int]) -> list[str]:

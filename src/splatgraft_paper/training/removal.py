@@ -25,12 +25,9 @@ from splatgraft_paper.training.recipes import Recipe, TrainingCost, say_plan
 
 CONDITIONS = 2
 """Images that condition the network: the image with the object, and the mask."""
-_SAMPLING_STEPS = 20
-"""DDIM steps of a prediction, set by hand."""
-_PARAMETERS = 865_000_000
-"""Parameters of Stable Diffusion 2's UNet."""
-_MULTIPLE = 64
-"""Pixels: 8 of the autoencoder times 8 of the UNet."""
+_SAMPLING_STEPS = 20  # DDIM steps of a prediction, set by hand
+_PARAMETERS = 865_000_000  # parameters of Stable Diffusion 2's UNet
+_MULTIPLE = 64  # pixels: 8 of the autoencoder times 8 of the UNet
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,9 @@ import torch
 
 from splatgraft_paper.training.pairs import RelitSample
 
-_SAMPLES = 3
-"""Rays per pixel and side, so that masks have soft edges."""
-_FIELD = 0.9
-"""Horizontal field of view, radians."""
-_UNIFORM = 0.5
-"""Radiance of the uniform light."""
+_SAMPLES = 3  # rays per pixel and side, so that masks have soft edges
+_FIELD = 0.9  # horizontal field of view, radians
+_UNIFORM = 0.5  # radiance of the uniform light
 
 
 @dataclass(frozen=True)

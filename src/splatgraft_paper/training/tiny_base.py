@@ -20,10 +20,8 @@ from splatgraft.runtime.files import atomic_folder
 from splatgraft.runtime.progress import Progress
 
 _LATENTS, _TEXT, _POOLED = 16, 32, 32
-_MEAN_STEPS = 50
-"""Steps over which the autoencoder's error is averaged."""
-_SHOWN = 64
-"""Pictures, at least, whose error is said at the end."""
+_MEAN_STEPS = 50  # steps over which the autoencoder's error is averaged
+_SHOWN = 64  # pictures, at least, whose error is said at the end
 
 
 @dataclass(frozen=True)

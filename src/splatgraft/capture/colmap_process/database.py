@@ -16,16 +16,13 @@ import pycolmap
 from .job import MIN_TRACK, Job
 
 NEIGHBOURING, PROMISING, ALL = "neighbouring", "promising", "all"
-_FEATURES = 4000
-"""Of a photo, the largest; the time of matching goes with its square. COLMAP takes 8192."""
+_FEATURES = 4000  # of a photo, the largest; the time of matching goes with its square. COLMAP takes 8192.
 _LARGE_PX = 1200
 """Longest side from which photos are not doubled in size to find features, which takes two thirds of the time."""
-_PRESELECT_ABOVE = 24
-"""Photos; up to this many, all pairs are compared with all features."""
+_PRESELECT_ABOVE = 24  # photos; up to this many, all pairs are compared with all features
 _PRESELECT_FEATURES = 1000
 """Largest features of a photo by which its partners are found (preemptive matching: Wu 2013, section 3)."""
-_PRESELECT_PARTNERS = 8
-"""A photo with fewer partners than this is compared with all others."""
+_PRESELECT_PARTNERS = 8  # A photo with fewer partners than this is compared with all others
 _MOST_PARTNERS = 16
 """Partners of a photo, those with most matches first: a background that stands still matches in all photos."""
 _FOCAL_RANGE = (0.35, 5.0)

@@ -29,10 +29,8 @@ from .scores import Answer, best_of, connected_photos, unposed
 
 _ALL, _MASKED = "photos", "masked"
 """Names of the databases: with all features, and with those inside the masks."""
-_ENOUGH_PHOTOS = 0.9
-"""A model with this share of all photos, and with all that have matches, may end the search."""
-_CLEAR_EXPLAINED = 0.5
-"""It ends the search where it explains this share of all verified matches."""
+_ENOUGH_PHOTOS = 0.9  # A model with this share of all photos, and with all that have matches, may end the search
+_CLEAR_EXPLAINED = 0.5  # it ends the search where it explains this share of all verified matches
 
 
 def main(words: dict[str, Any]) -> None:

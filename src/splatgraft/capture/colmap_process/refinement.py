@@ -19,14 +19,11 @@ from .database import copy_with_cameras
 from .job import Job, say
 from .scores import ALIKE, Matches, explained_shares, lens_numbers, posed_and_explained, read_matches
 
-_POOR_SHARE = 0.8
-"""A photo with less than this of the median photo's share of matches explained is posed anew."""
+_POOR_SHARE = 0.8  # A photo with less than this of the median photo's share of matches explained is posed anew
 _LENS_OBSERVATIONS = 300
 """Points that the photos of one camera must see for its whole lens to be solved: 30 for each of its numbers."""
-_LENS_ROUNDS = 3
-"""How often a lens is solved, each time with the matches that the last one explains."""
-_LENS_ERROR = 0.9
-"""Share to which the mean reprojection error of these photos must fall for their lenses to be taken."""
+_LENS_ROUNDS = 3  # how often a lens is solved, each time with the matches that the last one explains
+_LENS_ERROR = 0.9  # share to which the mean reprojection error of these photos must fall for their lenses to be taken
 _ADJUSTMENTS = 5
 """The most bundle adjustments in a row, each followed by dropping outliers (COLMAP: ba_global_max_refinements)."""
 _ADJUSTED_CHANGE = 0.0005

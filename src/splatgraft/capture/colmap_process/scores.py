@@ -13,8 +13,7 @@ import pycolmap
 
 from .job import MAX_ERROR_PX, MIN_TRACK
 
-_MIN_OBSERVATIONS = 30
-"""Points that a photo must see for its pose to count (COLMAP: abs_pose_min_num_inliers)."""
+_MIN_OBSERVATIONS = 30  # points that a photo must see for its pose to count (COLMAP: abs_pose_min_num_inliers)
 ALIKE = 0.99
 """Models whose score is above this share of the best one's are compared by their reprojection errors."""
 

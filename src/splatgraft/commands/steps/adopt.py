@@ -20,12 +20,10 @@ from splatgraft.project.step import Context, Inputs, Positional
 _MAX_DISTANCE = 0.1
 """Median distance from a point to the nearest Gaussian, over the points' radius, up to which they fit: scenes that were
 trained with these poses have about 0.01."""
-_BETTER = 0.3
-"""Factor on that distance below which other axes are named; set by hand."""
+_BETTER = 0.3  # factor on that distance below which other axes are named; set by hand
 _MAX_POINTS, _MIN_POINTS = 2000, 20
 """Points that are compared, and points below which nothing is said."""
-_AXES = ("RDF", "RUB", "LUF", "RFU")
-"""Axes that are tried: structure from motion, OpenGL, glTF, z up."""
+_AXES = ("RDF", "RUB", "LUF", "RFU")  # axes that are tried: structure from motion, OpenGL, glTF, z up
 
 
 @dataclass(frozen=True)

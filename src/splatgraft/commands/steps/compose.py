@@ -17,8 +17,7 @@ from splatgraft.project.layout import COVERAGE_FILE
 from splatgraft.project.step import Context, Inputs
 from splatgraft.runtime.note import Note
 
-_MUCH_UNSEEN = 0.2
-"""Share of the target's images that show an unphotographed side, from which on that is a warning."""
+_MUCH_UNSEEN = 0.2  # share of the target's images that show an unphotographed side, from which on that is a warning
 
 
 @dataclass(frozen=True)

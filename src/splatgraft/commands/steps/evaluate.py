@@ -155,8 +155,7 @@ class Evaluate:
         write_image(folder / "before_after.png", three)
 
 
-_WARNING_PX = 640
-"""Width of the pictures beside warnings: twice that at which the page shows them."""
+_WARNING_PX = 640  # width of the pictures beside warnings: twice that at which the page shows them
 _GEOMETRY_VIEWS = 2  # those that show the object best
 _GEOMETRY_PX = 640  # longest side: twice that at which the page shows them
 _LIMITS = (

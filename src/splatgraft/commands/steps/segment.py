@@ -63,10 +63,8 @@ SHEET_FILE = "views.png"
 AGREEMENT_FILE = "agreement.json"
 SOLID_SIDE_PX = 960
 """Longest side at which the object is made solid: time and memory go with the area."""
-_PICTURED = 8
-"""Photographs on the sheet."""
-_MUCH_GUESSED = 0.1
-"""Share of the surface that no photograph shows, from which on that is a warning."""
+_PICTURED = 8  # photographs on the sheet
+_MUCH_GUESSED = 0.1  # share of the surface that no photograph shows, from which on that is a warning
 
 
 @dataclass(frozen=True)

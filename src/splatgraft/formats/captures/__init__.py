@@ -9,8 +9,7 @@ from splatgraft.formats.captures.masks import PhotoFiles
 from splatgraft.formats.captures.transforms_json import read_json
 from splatgraft.formats.captures.views import CaptureFile, fitted_to_file, posed_images
 
-_MIN_PHOTOS = 3
-"""Photos with a pose: below it nothing is seen from two sides and checked by a third."""
+_MIN_PHOTOS = 3  # photos with a pose: below it nothing is seen from two sides and checked by a third
 
 
 def find_poses(path: Path) -> Path | None:

@@ -12,12 +12,10 @@ from PIL.TiffImagePlugin import IFDRational
 from splatgraft.core.exposure import Exposure
 from splatgraft.core.images import read_exif
 
-_MAX_ISO = 65535
-"""The tag has 16 bits."""
+_MAX_ISO = 65535  # the tag has 16 bits
 _AUTO, _MANUAL = 0, 1
 """Values of the tag WhiteBalance."""
-_MAX_STOPS = 40.0
-"""Largest APEX value; cameras write some 100 stops where they know nothing."""
+_MAX_STOPS = 40.0  # largest APEX value; cameras write some 100 stops where they know nothing
 
 
 def read_exposure(path: Path) -> Exposure:

@@ -12,8 +12,7 @@ PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
 _MASK_FOLDERS = ("masks", "mask")
 _MASK_ENDINGS = ("_mask", ".mask")
 """What comes before the suffix of a mask beside its photo: by default in Metashape, and in RealityCapture."""
-_ALPHA_SAMPLES = 8
-"""Number of files decoded to decide whether alpha channels are masks."""
+_ALPHA_SAMPLES = 8  # number of files decoded to decide whether alpha channels are masks
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,9 @@ from pathlib import Path, PurePosixPath
 from splatgraft.core.images import IMAGE_SUFFIXES
 
 _MAX_FILES = 20_000
-_MAX_BYTES = 32 << 30
-"""Of all photos together."""
-_MAX_RATIO = 20
-"""Unpacked over packed bytes; photos are compressed already, and masks are small."""
-_SMALL = 256 << 20
-"""Bytes up to which the ratio does not matter."""
+_MAX_BYTES = 32 << 30  # of all photos together
+_MAX_RATIO = 20  # unpacked over packed bytes; photos are compressed already, and masks are small
+_SMALL = 256 << 20  # bytes up to which the ratio does not matter
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Of the others zipfile unpacks each part that it reads whole, which may be thousands of times as large."""
 

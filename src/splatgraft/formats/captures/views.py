@@ -23,8 +23,7 @@ MIN_SHARE = 0.5
 """Share of the images that a capture names, and of its masks, that must be usable; with fewer, the folder is not the
 one that was meant."""
 
-_RIGID_TOLERANCE = 1e-3
-"""Largest entry of R^T R - I; allows matrices printed with four digits."""
+_RIGID_TOLERANCE = 1e-3  # largest entry of R^T R - I; allows matrices printed with four digits
 
 MAX_SIDE = 32766
 """Longest image side, pixels: OpenCV cannot undistort longer ones."""

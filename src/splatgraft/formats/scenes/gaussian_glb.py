@@ -27,22 +27,16 @@ from splatgraft.runtime.files import atomic_write
 
 AXES = "LUF"
 """Left, up, front."""
-_GENERATOR = "splatgraft"
-"""Whose extras are understood: those of other programs may mean anything."""
-_SPLATTING = "KHR_gaussian_splatting"
-"""The extension's name, which stands before those of its attributes as well."""
+_GENERATOR = "splatgraft"  # whose extras are understood: those of other programs may mean anything
+_SPLATTING = "KHR_gaussian_splatting"  # the extension's name, which stands before those of its attributes as well
 _MAGIC, _VERSION, _JSON, _BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_HEADER_BYTES = 28
-"""The file's header and those of the two chunks."""
-_RIGID = 1e-3
-"""Largest deviation of a node's matrix from a uniformly scaled rotation, over its scale."""
-_MAX_DEPTH = 100
-"""Deepest nesting of nodes."""
-_OPACITY_STEP = 0.25 / 65535
-"""Opacities of 0 and 1 become finite logits, by a quarter step of 16 bits."""
+_HEADER_BYTES = 28  # the file's header and those of the two chunks
+_RIGID = 1e-3  # largest deviation of a node's matrix from a uniformly scaled rotation, over its scale
+_MAX_DEPTH = 100  # deepest nesting of nodes
+_OPACITY_STEP = 0.25 / 65535  # opacities of 0 and 1 become finite logits, by a quarter step of 16 bits
 
 
 def read_gaussian_glb(path: Path) -> SceneFile:

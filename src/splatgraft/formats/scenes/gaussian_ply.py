@@ -27,8 +27,7 @@ _REST_COUNTS = tuple(3 * (spherical_harmonics.coefficient_count(d) - 1) for d in
 _ROWS_PER_WRITE = 1 << 14
 _KNOWN = re.compile(r"x|y|z|n[xyz]|f_dc_[0-2]|f_rest_[0-9]+|opacity|scale_[0-2]|rot_[0-3]|red|green|blue|alpha")
 """Properties that are read, empty normals, and colours for viewers."""
-_MAX_NAMED = 6
-"""Properties that a note names."""
+_MAX_NAMED = 6  # properties that a note names
 
 
 def read_gaussian_ply(path: Path) -> SceneFile:

@@ -19,8 +19,7 @@ from splatgraft.formats.scenes.quantization import writable
 from splatgraft.formats.scenes.scene_file import SceneMetadata
 
 _AXES = "RUB"
-_SIGMAS = 3.0
-"""Standard deviations that the extent holds."""
+_SIGMAS = 3.0  # standard deviations that the extent holds
 
 
 def write_gaussian_usdz(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:

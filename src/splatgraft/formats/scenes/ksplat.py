@@ -18,8 +18,7 @@ from splatgraft.formats.scenes.scene_file import SceneFile
 
 _HEADER_BYTES, _SECTION_HEADER_BYTES = 4096, 1024
 _SECTION = struct.Struct("<IIIIfH2xI4xIIH")
-_REST = (0, 9, 24)
-"""Numbers of bands above 0, by degree."""
+_REST = (0, 9, 24)  # numbers of bands above 0, by degree
 
 
 def read_ksplat(path: Path) -> SceneFile:

@@ -34,34 +34,25 @@ from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata, state
 from splatgraft.runtime.files import atomic_write
 
 _META_FILE = "meta.json"
-_OWN_KEY = "splatgraft"
-"""Where meta.json has the metadata of our own writer."""
+_OWN_KEY = "splatgraft"  # where meta.json has the metadata of our own writer
 _SQRT2 = 2**0.5
-_FIRST_TAG = 252
-"""Alpha of a quaternion whose largest component is w; x, y, z follow."""
-_PALETTE_COLUMNS = 64
-"""Entries in a row of the palette's picture."""
+_FIRST_TAG = 252  # alpha of a quaternion whose largest component is w; x, y, z follow
+_PALETTE_COLUMNS = 64  # entries in a row of the palette's picture
 _MIN_PALETTE, _MAX_PALETTE = 1 << 10, 1 << 16
-_GAUSSIANS_PER_ENTRY = 4
-"""Gaussians that share an entry of the palette, chosen by size and PSNR of the demo's scenes."""
+_GAUSSIANS_PER_ENTRY = 4  # gaussians that share an entry of the palette, chosen by size and PSNR of the demo's scenes
 _MAX_PIXELS_PER_BYTE = 100
 """Largest picture that its bytes can hold: random bytes have 0.3, a scene of few different Gaussians 50; smaller
 pictures may have more."""
 _FREE_PIXELS = 1 << 20
-_MAX_META_BYTES = 1 << 24
-"""Of meta.json, which has some 20 kB."""
-_MAX_EXPANSION = 10
-"""Bytes of a file over those in the zip; pictures are compressed already."""
-_FREE_BYTES = 1 << 20
-"""Files below this size may expand further."""
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""The others are unpacked whole, whatever size the zip states."""
+_MAX_META_BYTES = 1 << 24  # of meta.json, which has some 20 kB
+_MAX_EXPANSION = 10  # bytes of a file over those in the zip; pictures are compressed already
+_FREE_BYTES = 1 << 20  # files below this size may expand further
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the others are unpacked whole, whatever size the zip states
 _MAX_LOG_POSITION = 60.0
 _CODES = 256
 _SCALAR_ROUNDS = 100
 _COARSE_GROUPS = 256
-_COARSE_SAMPLE = 1 << 15
-"""Rows that the coarse groups are found from."""
+_COARSE_SAMPLE = 1 << 15  # rows that the coarse groups are found from
 _ROUNDS = 5
 """Rounds of k-means for the coarse groups and for the entries in each; more rounds changed the pictures of a demo by
 less than 0.1 dB."""

@@ -35,12 +35,10 @@ _TABLE_START = struct.Struct("<I12x")
 _TABLE_ENTRY = struct.Struct("<QQ")
 _ANTIALIASED = 1
 _GZIP = 31
-_ZSTD_LEVEL = 12
-"""The level of the format's own library."""
+_ZSTD_LEVEL = 12  # the level of the format's own library
 _MAX_EXPANSION = 100
 """Bytes of the arrays over compressed ones; files of trained scenes have about 2, a few repeated Gaussians 50."""
-_FREE_BYTES = 1 << 20
-"""Arrays below this size may expand further."""
+_FREE_BYTES = 1 << 20  # arrays below this size may expand further
 _COLOR_SCALE = 0.15
 _HALF_SQRT2 = 0.5**0.5
 

@@ -24,16 +24,11 @@ _IMAGES = ("composite", "background", "mask", "log_ratio", "depth", "normal")
 # how views are encoded for the network: fixed by the weights that were trained with it
 _RATIO_OFFSET = 0.004
 """Linear light added to both sides of a ratio: 1/255 of white, below which a ratio carries no information."""
-_MAX_LOG_RATIO = 3.0
-"""Bound of the prior's log ratio, either sign."""
-_MAX_LOG_GAIN = 4.0
-"""Bound of the total log gain that is applied, either sign."""
-_MAX_LOG_DEPTH = 2.0
-"""Bound of the relative log depth, either sign; also the value where nothing is hit."""
-_LOG_OFFSET = 1 / 64
-"""Linear light added before the logarithm of a colour channel."""
-_LUMA_GAMMA = 2.2
-"""Brightness axis of the bilateral grid: mean linear light to the power of its inverse."""
+_MAX_LOG_RATIO = 3.0  # bound of the prior's log ratio, either sign
+_MAX_LOG_GAIN = 4.0  # bound of the total log gain that is applied, either sign
+_MAX_LOG_DEPTH = 2.0  # bound of the relative log depth, either sign; also the value where nothing is hit
+_LOG_OFFSET = 1 / 64  # linear light added before the logarithm of a colour channel
+_LUMA_GAMMA = 2.2  # brightness axis of the bilateral grid: mean linear light to the power of its inverse
 
 
 @dataclass(frozen=True)

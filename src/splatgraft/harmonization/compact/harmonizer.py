@@ -8,14 +8,11 @@ from splatgraft.harmonization.compact.features import apply_output, compact_inpu
 from splatgraft.harmonization.compact.network import CompactNetwork
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
 
-_STRIDE = 16
-"""The network halves the image four times."""
+_STRIDE = 16  # the network halves the image four times
 
 
-_LONG_SIDE = 256
-"""Pixels of the longer side of the network's input; smaller views are not enlarged."""
-_HALF_CONFIDENCE_ERROR = 0.05
-"""sRGB; the expected error at which the confidence is one half."""
+_LONG_SIDE = 256  # pixels of the longer side of the network's input; smaller views are not enlarged
+_HALF_CONFIDENCE_ERROR = 0.05  # sRGB; the expected error at which the confidence is one half
 
 
 class Compact:

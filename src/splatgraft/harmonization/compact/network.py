@@ -24,14 +24,10 @@ _FORMAT = "splatgraft compact 1"
 
 # bounds of the outputs, either sign: fixed by the weights that were trained with them
 _MAX_LOG_GAIN = 2.0
-_MAX_PRIOR_SCALE = 1.0
-"""Largest difference of the prior's factor from 1."""
-_MAX_ADDED_LIGHT = 0.25
-"""Linear light, off the object."""
-_MAX_AFFINE = 0.5
-"""Largest entry of the colour maps' differences from the identity."""
-_INITIAL_LOG_ERROR = -3.0
-"""The log of the expected error before training."""
+_MAX_PRIOR_SCALE = 1.0  # largest difference of the prior's factor from 1
+_MAX_ADDED_LIGHT = 0.25  # linear light, off the object
+_MAX_AFFINE = 0.5  # largest entry of the colour maps' differences from the identity
+_INITIAL_LOG_ERROR = -3.0  # the log of the expected error before training
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,7 @@ BASE = REPOSITORIES["flux"]
 _AUTHORS = REPOSITORIES["dot3d"]
 _BYTES = {"bf16": 2.0, "fp8": 1.0, "offload": 0.1}
 """Bytes of a parameter on the device, best precision first; offload holds the two blocks in use."""
-_RESERVED_BYTES = 1.2e9
-"""For the autoencoder, the CUDA context, kernels and fragmentation. An estimate."""
+_RESERVED_BYTES = 1.2e9  # for the autoencoder, the CUDA context, kernels and fragmentation. An estimate.
 
 
 def diffusers_library() -> Any:

@@ -44,53 +44,37 @@ from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, with_
 from splatgraft.rendering import render
 
 # the evidence; set by hand
-_OVERHEAD = 0.5
-"""Cosine to the up direction of what counts as ceiling, 60 degrees."""
+_OVERHEAD = 0.5  # cosine to the up direction of what counts as ceiling, 60 degrees
 _MIN_RADII, _MAX_RADII = 3.0, 8.0
 """Object radii: limits of the radius of the region of evidence; between them it is the cameras' median distance."""
-_HIGHLIGHTS_WITHIN = 0.5
-"""Radii of the region within which highlights count."""
-_FAR = 0.9
-"""Radii of the region from which on light counts as coming from outside of it."""
+_HIGHLIGHTS_WITHIN = 0.5  # radii of the region within which highlights count
+_FAR = 0.9  # radii of the region from which on light counts as coming from outside of it
 
 # what is a source; none of these numbers is sensitive
-_OVER_MEDIAN = 4.0
-"""Luminance of a peak over the median of all directions."""
-_MIN_SHARE = 0.02
-"""Smallest share of all light that comes from one direction of a peak."""
+_OVER_MEDIAN = 4.0  # luminance of a peak over the median of all directions
+_MIN_SHARE = 0.02  # smallest share of all light that comes from one direction of a peak
 _MAX_SOURCES = 4
 _NEIGHBOUR_COSINE = math.cos(math.radians(14))
 """Cosine of the largest angle to the brightest direction at which a direction belongs to its source."""
-_SUN = 0.03
-"""Steradians; a smaller clipped patch may show the sun, whose rays are parallel."""
-_LAMP = 0.64
-"""Sine of the height from which a source in a room is a lamp, and below it a window."""
+_SUN = 0.03  # steradians; a smaller clipped patch may show the sun, whose rays are parallel
+_LAMP = 0.64  # sine of the height from which a source in a room is a lamp, and below it a window
 _SEEN_NAMES, _UNSEEN_NAMES = ("window", "lamp"), ("sun or window", "sun or lamp")
 """Of sources with a surface behind them, and of those that no picture shows: low ones and high ones."""
-_SAME_SOURCE = 0.94
-"""Cosine between two sources from which they are one: 20 degrees."""
-_SKY = 0.5
-"""Share of `FARTHEST` from which nothing stands behind a bright patch."""
-_UNSEEN_RADIUS_DEG = 1.0
-"""Angular radius of a source that no camera saw, beside the uncertainty of its direction."""
-_HALF_BIN_DEG = 4.0
-"""Error of a direction that is known to one of `DIRECTIONS` alone."""
-_CLIPPED_ERROR_DEG = 2.0
-"""Error of the middle of a clipped patch."""
+_SAME_SOURCE = 0.94  # cosine between two sources from which they are one: 20 degrees
+_SKY = 0.5  # share of `FARTHEST` from which nothing stands behind a bright patch
+_UNSEEN_RADIUS_DEG = 1.0  # angular radius of a source that no camera saw, beside the uncertainty of its direction
+_HALF_BIN_DEG = 4.0  # error of a direction that is known to one of `DIRECTIONS` alone
+_CLIPPED_ERROR_DEG = 2.0  # error of the middle of a clipped patch
 
 # the view towards a source; set by hand
-_SOURCE_IMAGE = (32.0, 16)
-"""Focal length and width, pixels, of the depth image."""
-_SOURCE_QUANTILE = 0.25
-"""Quantile of the depths in that image that is the distance to the source."""
-_BLOCKERS_WITHIN = 0.7
-"""Share of that distance within which occluders block the source."""
+_SOURCE_IMAGE = (32.0, 16)  # focal length and width, pixels, of the depth image
+_SOURCE_QUANTILE = 0.25  # quantile of the depths in that image that is the distance to the source
+_BLOCKERS_WITHIN = 0.7  # share of that distance within which occluders block the source
 
 # the environment map
 _SMOOTH_RAD = math.radians(8.0)
 """Width of the kernel that interpolates between the estimate's directions, which are 11 degrees apart; set by hand."""
-_CHUNK = 65_536
-"""Directions that are interpolated at a time."""
+_CHUNK = 65_536  # directions that are interpolated at a time
 
 
 @dataclass(frozen=True)

@@ -28,82 +28,53 @@ from splatgraft.relighting.light.panorama import DIRECTIONS, FARTHEST, nearest_d
 from splatgraft.relighting.normals import is_seen
 from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occluders_of, splat_depth_maps, visibility
 
-_SEED = 0
-"""Seed of all random choices of Gaussians."""
-_DARKEST_CHROMA = 1e-3
-"""Linear light; channels darker than this count as this in chromaticities."""
+_SEED = 0  # seed of all random choices of Gaussians
+_DARKEST_CHROMA = 1e-3  # linear light; channels darker than this count as this in chromaticities
 
 # surfaces whose brightness is explained; none of these numbers is sensitive
 _MAX_RECEIVERS = 1000
-_MIN_RECEIVERS = 200
-"""With fewer there is no evidence."""
-_RECEIVER_OPACITY = 0.3
-"""Opacity below which a Gaussian is no receiver."""
-_MIN_NORMAL_CONFIDENCE = 0.1
-"""Confidence of its normal below which a Gaussian is no receiver."""
-_DARKEST = 0.01
-"""sRGB; darker channels count as this."""
+_MIN_RECEIVERS = 200  # with fewer there is no evidence
+_RECEIVER_OPACITY = 0.3  # opacity below which a Gaussian is no receiver
+_MIN_NORMAL_CONFIDENCE = 0.1  # confidence of its normal below which a Gaussian is no receiver
+_DARKEST = 0.01  # sRGB; darker channels count as this
 _HALF_WEIGHT = 0.02
 """Linear brightness at which a receiver has half its weight: almost black ones say little about light."""
 _ENCLOSED = 0.15
 """Share of the directions above a surface that are open; with less it is inside something, and is left out."""
-_MAX_OCCLUDERS = 16000
-"""Gaussians that block light, chosen at random and grown to cover the same area."""
-_OCCLUDER_OPACITY = 0.1
-"""Opacity below which a Gaussian blocks no light."""
-_OCCLUDERS_WITHIN = 1.3
-"""Radii of the region within which Gaussians block light."""
-_MAP_SIZE = 128
-"""Pixels, a multiple of 16: width of a shadow map."""
-_BIAS = 1.5
-"""Pixels of a map; a nearer occluder is the receiver's own surface."""
-_MATERIALS = 24
-"""Groups of surfaces."""
-_MATERIAL_ROUNDS = 12
-"""Iterations of k-means."""
-_POSITION_UNIT = 0.4
-"""Radii of the region; the unit of position among the features."""
+_MAX_OCCLUDERS = 16000  # gaussians that block light, chosen at random and grown to cover the same area
+_OCCLUDER_OPACITY = 0.1  # opacity below which a Gaussian blocks no light
+_OCCLUDERS_WITHIN = 1.3  # radii of the region within which Gaussians block light
+_MAP_SIZE = 128  # pixels, a multiple of 16: width of a shadow map
+_BIAS = 1.5  # pixels of a map; a nearer occluder is the receiver's own surface
+_MATERIALS = 24  # groups of surfaces
+_MATERIAL_ROUNDS = 12  # iterations of k-means
+_POSITION_UNIT = 0.4  # radii of the region; the unit of position among the features
 _GREEN_MAGENTA = 0.25
 """Unit of log(green / sqrt(red blue)) among all features, where that of log(red / blue) is 1: that one is large, as sun
 and sky differ along it (Finlayson 2006)."""
-_RECEIVER_CHUNK = 100
-"""Receivers at a time; bounds memory."""
+_RECEIVER_CHUNK = 100  # receivers at a time; bounds memory
 
 # groups by colour and normal; set by hand
 _MAX_GROUPS = 20
-_MIN_MEMBERS = 60
-"""Gaussians of the sample per group; fewer make fewer groups, but two."""
-_MAX_SAMPLE = 6000
-"""Gaussians on which the means are fitted, chosen at random."""
-_GROUP_ROUNDS = 8
-"""Iterations of k-means."""
-_NORMAL_UNIT = 0.6
-"""Unit of normals among the features."""
+_MIN_MEMBERS = 60  # gaussians of the sample per group; fewer make fewer groups, but two
+_MAX_SAMPLE = 6000  # gaussians on which the means are fitted, chosen at random
+_GROUP_ROUNDS = 8  # iterations of k-means
+_NORMAL_UNIT = 0.6  # unit of normals among the features
 
 # highlights; set by hand
-_MAX_HIGHLIGHTS = 2000
-"""Gaussians, chosen at random."""
-_MIN_HIGHLIGHTS = 200
-"""Gaussians, and pairs of Gaussian and camera; with fewer there is no evidence."""
-_MIN_CAMERAS = 3
-"""With fewer there is no evidence."""
-_HIGHLIGHT_OPACITY = 0.3
-"""Opacity below which a Gaussian is left out."""
-_HIGHLIGHT_CONFIDENCE = 0.3
-"""Confidence of its normal below which a Gaussian is left out."""
-_LOWEST_COSINE = 0.1
-"""Between normal and camera; flatter views are left out."""
+_MAX_HIGHLIGHTS = 2000  # gaussians, chosen at random
+_MIN_HIGHLIGHTS = 200  # gaussians, and pairs of Gaussian and camera; with fewer there is no evidence
+_MIN_CAMERAS = 3  # with fewer there is no evidence
+_HIGHLIGHT_OPACITY = 0.3  # opacity below which a Gaussian is left out
+_HIGHLIGHT_CONFIDENCE = 0.3  # confidence of its normal below which a Gaussian is left out
+_LOWEST_COSINE = 0.1  # between normal and camera; flatter views are left out
 _SQUARINGS = 3
 """The lobe is cos^(2^squarings), cos^8: 24 degrees wide at half height, as narrow as harmonics of degree 3 can be, and
 wide enough for windows."""
-_ROUGHNESS = 0.707
-"""Roughness of rough surfaces; its square is GGX's alpha, .5: of the order of stone, wood and grass."""
-_FACING = 0.04
-"""Reflectance of dielectrics that face the camera."""
-_MAX_EXPLAINED = 0.98
-"""Share of the change that a light is said to explain."""
-_HIGHLIGHT_CHUNK = 250
-"""Gaussians at a time; bounds memory."""
+_ROUGHNESS = 0.707  # roughness of rough surfaces; its square is GGX's alpha, .5: of the order of stone, wood and grass
+_FACING = 0.04  # reflectance of dielectrics that face the camera
+_MAX_EXPLAINED = 0.98  # share of the change that a light is said to explain
+_HIGHLIGHT_CHUNK = 250  # gaussians at a time; bounds memory
 
 
 def group_materials(brightness: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]) -> Int[Tensor, "m"]:
@@ -271,8 +242,7 @@ def _rough(normals: Float[Tensor, "p 3"], towards: Float[Tensor, "p v 3"]) -> Fl
     return spread * fresnel * light / masked.clamp_min(1e-6) * (light > 0)
 
 
-_LOBES = (_polished, _rough)
-"""What a material may be."""
+_LOBES = (_polished, _rough)  # what a material may be
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,11 @@ _AMBIENT_COUNT = 9
 _UNCERTAINTY_BLUR = 0.5
 """Share of a direction's uncertainty that blurs shadows; measured: least error in rendered scenes. All of it makes
 shadows of a right direction too pale."""
-_UNCERTAIN_DEG = 15.0
-"""Uncertainty of a direction from which on a report says so; set by hand."""
+_UNCERTAIN_DEG = 15.0  # uncertainty of a direction from which on a report says so; set by hand
 _MIN_AMBIENT = 1e-3
 """Share of the largest ambient coefficient below which ambient irradiance does not fall: expansions may be negative."""
 
-_MIN_DISTANCE = 1e-4
-"""World units; minimum distance of a source in a light.json, whose numbers have four decimals."""
+_MIN_DISTANCE = 1e-4  # world units; minimum distance of a source in a light.json, whose numbers have four decimals
 _SOURCE_NUMBERS = {
     "angular_radius_deg": (0.0, 90.0),
     "uncertainty_deg": (0.0, 90.0),
@@ -35,8 +33,7 @@ _SOURCE_NUMBERS = {
 }
 """Fields of a source that are one number, and its bounds; a light.json leaves out what is infinite."""
 
-_RIGID = 1e-4
-"""Largest entry of R R^T - I of a rotation in a light.json."""
+_RIGID = 1e-4  # largest entry of R R^T - I of a rotation in a light.json
 
 _WEAK, _STRONG = 0.25, 0.6
 """Shares of a source in the light on what faces it, below and above which words say so."""
@@ -256,8 +253,7 @@ def _numbers(values: object, count: int, where: str, bounds: tuple[float, float]
 
 _C0 = 0.28209479
 """The harmonics' first band; rounded, and kept so: `core.spherical_harmonics.C0` would change written priors."""
-_UNCERTAIN_DEG = 20.0
-"""Degrees of direction uncertainty at which a source counts exp(-1); set by hand."""
+_UNCERTAIN_DEG = 20.0  # degrees of direction uncertainty at which a source counts exp(-1); set by hand
 
 
 def light_confidence(light: Light) -> float:

@@ -25,8 +25,7 @@ SOLID_ANGLE = 4 * math.pi / len(DIRECTIONS)
 """Steradians of each direction."""
 FARTHEST = 1e4
 """World units; what is farther away counts as so far."""
-_TABLE = 64
-"""Pixels; width of a face of the cube map that tells which of the directions is nearest."""
+_TABLE = 64  # pixels; width of a face of the cube map that tells which of the directions is nearest
 
 # rows right, down and forward of each face: +x, -x, +y, -y, +z, -z
 _FACES = torch.tensor(
@@ -40,32 +39,23 @@ _FACES = torch.tensor(
     ]
 )
 # panoramas; set by hand
-_FAINTEST = 0.02
-"""Alpha below which a pixel is empty: its colour is noise."""
+_FAINTEST = 0.02  # alpha below which a pixel is empty: its colour is noise
 _WIDEST = 0.2
 """Standard deviation over distance; wider Gaussians are left out, as splatting's affine approximation smears them."""
 
 # when there is light at a place; set by hand
 NEAREST = 0.5
 """Object radii within which Gaussians are left out of the panorama."""
-_TEST_SIZE = 24
-"""Pixels; width of a face of the depth cube map that tests whether the place is inside something."""
-_BLOCKED_WITHIN = 0.4
-"""Object radii; a nearer surface blocks the view."""
-_MAX_BLOCKED = 0.6
-"""Share of views; with more blocked the place is inside something."""
-_MIN_COVERAGE = 0.1
-"""Share of the surroundings that must be captured, in [0, 1]."""
-_DARKEST = 2e-3
-"""Mean linear radiance; a darker place has no light."""
+_TEST_SIZE = 24  # pixels; width of a face of the depth cube map that tests whether the place is inside something
+_BLOCKED_WITHIN = 0.4  # object radii; a nearer surface blocks the view
+_MAX_BLOCKED = 0.6  # share of views; with more blocked the place is inside something
+_MIN_COVERAGE = 0.1  # share of the surroundings that must be captured, in [0, 1]
+_DARKEST = 2e-3  # mean linear radiance; a darker place has no light
 
 # what counts as captured and as clipped in the surroundings
-_SURROUNDINGS_SIZE = 48
-"""Pixels; width of a face of the panorama."""
-_MIN_ALPHA = 0.3
-"""Alpha below which nothing was captured."""
-_CLIPPED = 0.955
-"""sRGB of the brightest channel from which a camera may have clipped; reconstruction loses a little."""
+_SURROUNDINGS_SIZE = 48  # pixels; width of a face of the panorama
+_MIN_ALPHA = 0.3  # alpha below which nothing was captured
+_CLIPPED = 0.955  # sRGB of the brightest channel from which a camera may have clipped; reconstruction loses a little
 
 
 @dataclass(frozen=True)

@@ -22,25 +22,17 @@ from splatgraft.relighting.light.evidence import HighlightEvidence, ShadingEvide
 from splatgraft.relighting.light.panorama import DIRECTIONS, Surroundings
 
 _MAX_ALBEDO = math.log(0.9)
-_ABOVE_MAX = 100.0
-"""Precision of the prior that keeps albedo below 0.9."""
-_LARGEST_STEP = 1.5
-"""Largest change of any logarithm in one step."""
-_DARKEST = 1e-3
-"""Radiance that the sky is taken to have where nothing at all was seen."""
-_PRESENT = 0.02
-"""Share of a direction that is clipped, from which it has an unknown."""
-_UNSEEN = 0.05
-"""The same for unseen ones."""
-_TOUCHING = math.cos(math.radians(15))
-"""Clipped directions nearer than this are one patch."""
+_ABOVE_MAX = 100.0  # precision of the prior that keeps albedo below 0.9
+_LARGEST_STEP = 1.5  # largest change of any logarithm in one step
+_DARKEST = 1e-3  # radiance that the sky is taken to have where nothing at all was seen
+_PRESENT = 0.02  # share of a direction that is clipped, from which it has an unknown
+_UNSEEN = 0.05  # the same for unseen ones
+_TOUCHING = math.cos(math.radians(15))  # clipped directions nearer than this are one patch
 _LOWEST = math.sin(math.radians(-8))
 """Least sine of the height of what may be a source: a window beside a table reaches below the horizon, reflections lie
 lower."""
-_MAX_PATCHES = 5
-"""Clipped patches that may be sources; the search tries all their combinations."""
-_SMALLEST = 0.05
-"""Directions that such a patch covers at least."""
+_MAX_PATCHES = 5  # clipped patches that may be sources; the search tries all their combinations
+_SMALLEST = 0.05  # directions that such a patch covers at least
 
 
 @dataclass(frozen=True)

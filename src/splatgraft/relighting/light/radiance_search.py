@@ -24,28 +24,18 @@ from splatgraft.relighting.light.radiance_model import (
     unseen_cost,
 )
 
-_RELEVELED = 0.7
-"""Share of the mean residual that albedos take up before a state is polished."""
-_WHITE = 0.3
-"""Radiance beyond white that a clipped lamp starts from, at least."""
-_MIN_SHARE = 0.1
-"""Share of a direction that must be unknown for a lamp in it."""
+_RELEVELED = 0.7  # share of the mean residual that albedos take up before a state is polished
+_WHITE = 0.3  # radiance beyond white that a clipped lamp starts from, at least
+_MIN_SHARE = 0.1  # share of a direction that must be unknown for a lamp in it
 
 # how many local maxima are looked for, and how they are averaged
-_COMBINATIONS = 3
-"""Combinations of clipped patches that are polished."""
-_LAMPS = 5
-"""Single directions that are tried as lamps."""
-_MORE_LAMPS = 2
-"""Directions that are tried as one more lamp beside the best maximum."""
-_STRENGTHS = (4.0, 12.0, 40.0, 120.0)
-"""Radiance of a lamp over what is there without it."""
-_APART = math.radians(18)
-"""Radians between directions that are tried."""
-_SAME = 0.04
-"""Root mean square of log irradiance between maxima, below which they are one."""
-_SPREAD = math.radians(35)
-"""Radians around a lamp over which its direction is uncertain at most."""
+_COMBINATIONS = 3  # combinations of clipped patches that are polished
+_LAMPS = 5  # single directions that are tried as lamps
+_MORE_LAMPS = 2  # directions that are tried as one more lamp beside the best maximum
+_STRENGTHS = (4.0, 12.0, 40.0, 120.0)  # radiance of a lamp over what is there without it
+_APART = math.radians(18)  # radians between directions that are tried
+_SAME = 0.04  # root mean square of log irradiance between maxima, below which they are one
+_SPREAD = math.radians(35)  # radians around a lamp over which its direction is uncertain at most
 
 
 @dataclass(frozen=True)

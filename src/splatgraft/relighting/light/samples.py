@@ -14,10 +14,8 @@ from splatgraft.core.directions import even_pairs, vogel_offsets
 from splatgraft.relighting.light.light import Light, LightSource
 
 # how finely a light is sampled
-_AMBIENT_SAMPLES = 32
-"""Directions over the sphere, an even number; set by hand."""
-_SOURCE_SAMPLES = 9
-"""Most samples of all sources together; set by hand."""
+_AMBIENT_SAMPLES = 32  # directions over the sphere, an even number; set by hand
+_SOURCE_SAMPLES = 9  # most samples of all sources together; set by hand
 _SINGLE_SOFTNESS = math.radians(8.0)
 """Radians; a source up to this softness is one sample. Measured: one filtered map is then within 0.02 of rays."""
 

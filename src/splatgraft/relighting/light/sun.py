@@ -31,20 +31,13 @@ from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occlude
 from splatgraft.rendering import Render
 
 # the picture of the surface; set by hand
-_SIZE = 192
-"""Texels, a multiple of 16: width of the picture and of the shadow maps."""
-_MAX_POINTS = 6000
-"""Points among which the plane is looked for."""
-_PLANE = LevelPlaneOptions(inlier_share=0.2, thickness=0.035)
-"""What counts as a surface around the place."""
-_SOLID = 0.9
-"""Alpha from which a pixel shows a surface."""
-_FLATTEST = 0.12
-"""Cosine between a ray and the normal below which a view is too flat to count."""
-_MIN_VIEWS = 2
-"""Views that must show a texel."""
-_MIN_TEXELS = 1500
-"""With fewer there is no evidence."""
+_SIZE = 192  # texels, a multiple of 16: width of the picture and of the shadow maps
+_MAX_POINTS = 6000  # points among which the plane is looked for
+_PLANE = LevelPlaneOptions(inlier_share=0.2, thickness=0.035)  # what counts as a surface around the place
+_SOLID = 0.9  # alpha from which a pixel shows a surface
+_FLATTEST = 0.12  # cosine between a ray and the normal below which a view is too flat to count
+_MIN_VIEWS = 2  # views that must show a texel
+_MIN_TEXELS = 1500  # with fewer there is no evidence
 _WHITE, _BLACK = 0.93, 0.01
 """Linear; texels with a brighter channel may be clipped, darker ones are noise."""
 
@@ -53,55 +46,35 @@ _COARSE, _FINE, _ACROSS = 6, 3, 14
 """Texels between those that are compared: in the search, in its refinement, and for the ratio of lit to shaded."""
 _MAX_GREEN, _MAX_RED = 0.15, 1.2
 """Largest difference of log(green / sqrt(red blue)) and of log(red / blue); sun and sky differ along the latter."""
-_NOISE = 0.12
-"""Scale of differences of log luminance within a material."""
+_NOISE = 0.12  # scale of differences of log luminance within a material
 _SHADED_TEXEL, _SHADED_TILE = 0.15, 0.5
 """Probability that something unseen shades a texel, and a whole tile."""
-_EDGE = 0.9
-"""Least difference of visibility between texels on both sides of a shadow's edge."""
-_TILES = 8
-"""Tiles along a side of the picture."""
+_EDGE = 0.9  # least difference of visibility between texels on both sides of a shadow's edge
+_TILES = 8  # tiles along a side of the picture
 
 # the search
-_DIRECTIONS = even_directions(1600)
-"""5 degrees apart."""
-_AMBIENT_DIRECTIONS = even_directions(200)
-"""From which all other light comes, on both sides of the surface."""
-_DARKEST = 0.02
-"""Least share of that light at a texel, since some of it is reflected by what blocks the rest."""
-_STANDING_WITHIN = 1.4
-"""Radii of the region within which things cast shadows."""
-_LOWEST = math.sin(math.radians(2.0))
-"""Least sine of the sun's height over the surface."""
-_AT_ONCE = 64
-"""Directions at a time; bounds memory."""
-_STRENGTHS = (1.0, 3.0, 9.0)
-"""Irradiance of the sun over that of all other light on the surface, in the search."""
+_DIRECTIONS = even_directions(1600)  # 5 degrees apart
+_AMBIENT_DIRECTIONS = even_directions(200)  # from which all other light comes, on both sides of the surface
+_DARKEST = 0.02  # least share of that light at a texel, since some of it is reflected by what blocks the rest
+_STANDING_WITHIN = 1.4  # radii of the region within which things cast shadows
+_LOWEST = math.sin(math.radians(2.0))  # least sine of the sun's height over the surface
+_AT_ONCE = 64  # directions at a time; bounds memory
+_STRENGTHS = (1.0, 3.0, 9.0)  # irradiance of the sun over that of all other light on the surface, in the search
 _FINE_STRENGTHS = (0.5, 1.0, 1.8, 3.0, 5.0, 10.0)
-_MODES = 4
-"""Local maxima that are refined."""
-_APART = math.cos(math.radians(8.0))
-"""Cosine of the smallest angle between two."""
-_SPANS = ((3.0, 1.0), (1.0, 0.33))
-"""Half width and step of the grids around a maximum, degrees."""
-_PROMISING = 10.0
-"""Log likelihood over that of even light from which a direction of the search is refined."""
+_MODES = 4  # local maxima that are refined
+_APART = math.cos(math.radians(8.0))  # cosine of the smallest angle between two
+_SPANS = ((3.0, 1.0), (1.0, 0.33))  # half width and step of the grids around a maximum, degrees
+_PROMISING = 10.0  # log likelihood over that of even light from which a direction of the search is refined
 _DECISIVE = 40.0
 """Log likelihood over that of all other light from which there is a sun; chosen with benchmarks/fit_sun.py."""
-_MIN_RATIO = 0.3
-"""Least irradiance of a sun over that of all other light, with less it is none."""
-_MIN_RATIO_BY_HAND = 0.6
-"""The same of a sun set by hand where no edge of a shadow shows its strength."""
+_MIN_RATIO = 0.3  # least irradiance of a sun over that of all other light, with less it is none
+_MIN_RATIO_BY_HAND = 0.6  # the same of a sun set by hand where no edge of a shadow shows its strength
 _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12
 """Angular radii that are tried, and the directions that stand for each."""
-_BLURS = 5
-"""Widths of the reconstruction's blur that are tried beside each radius."""
-_UNSEEN_RADIUS_DEG = 1.0
-"""Angular radius of a sun set by hand where no edge of a shadow shows it."""
-_SOFTER = 3.0
-"""Log likelihood over that of a smaller radius from which a larger one is taken: 20 to 1."""
-_ERROR_DEG = 1.0
-"""Standard error of a direction that was found, and the least of one that was set by hand."""
+_BLURS = 5  # widths of the reconstruction's blur that are tried beside each radius
+_UNSEEN_RADIUS_DEG = 1.0  # angular radius of a sun set by hand where no edge of a shadow shows it
+_SOFTER = 3.0  # log likelihood over that of a smaller radius from which a larger one is taken: 20 to 1
+_ERROR_DEG = 1.0  # standard error of a direction that was found, and the least of one that was set by hand
 _AROUND_SHADOW = 2.5
 """Distances from a point to its shadow: radius of the region in which the strength of a sun set by hand is measured."""
 

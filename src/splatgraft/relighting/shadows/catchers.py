@@ -24,20 +24,14 @@ from splatgraft.relighting.shadows.scene_ratio import DARKEST, SceneRatio
 from splatgraft.relighting.shadows.surface_views import GAMMA, SurfaceView, blended_values
 
 # set by hand
-_OPAQUE = 0.97
-"""Share of a pixel from which on colours of the surface alone make its shadow."""
+_OPAQUE = 0.97  # share of a pixel from which on colours of the surface alone make its shadow
 _AROUND, _UNDER = 16, 1.0
 """Receivers around a point; how many standard deviations of their height a catcher lies under their mean."""
-_FAINTEST = 0.03
-"""Share of light; where less is lost there are no catchers."""
-_WIDTH = 0.6
-"""Standard deviation over the spacing: a square lattice of them is even to a percent."""
-_FLAT = 0.1
-"""Standard deviation along the normal over that across it."""
-_REACH = 3.0
-"""Standard deviations within which catchers overlap."""
-_CLEAREST = 1e-6
-"""Opacity of those without any depth."""
+_FAINTEST = 0.03  # share of light; where less is lost there are no catchers
+_WIDTH = 0.6  # standard deviation over the spacing: a square lattice of them is even to a percent
+_FLAT = 0.1  # standard deviation along the normal over that across it
+_REACH = 3.0  # standard deviations within which catchers overlap
+_CLEAREST = 1e-6  # opacity of those without any depth
 _ROUNDS, _MOST = 2, 1.5
 """How often depths are corrected by what the views show, and the largest factor."""
 

@@ -19,24 +19,17 @@ from splatgraft.relighting.shadows.shadow_maps import FAR, DepthMaps
 from splatgraft.runtime.kernels import kernel, serialized
 
 # compiled into the kernel; all set by hand
-_COARSEST = 4
-"""Pixels; width of the mip pyramid's last level."""
-_SEARCH_TAPS = 8
-"""Taps of the blocker search."""
+_COARSEST = 4  # pixels; width of the mip pyramid's last level
+_SEARCH_TAPS = 8  # taps of the blocker search
 _SOURCE_TAPS, _AMBIENT_TAPS = 24, 12
 """Taps of the visibility filter: the noise of many ambient samples averages out, that of few sources does not."""
-_FEW_SAMPLES = 16
-"""Fewer samples than this are taken for sources."""
-_SEARCH_GAP = 0.8
-"""Distance between neighbouring taps of the search over the radius of its disk."""
-_BLUR = np.float32(1.5)
-"""A mip level is used up to a tap distance of this many of its pixels."""
-_WIDEST_CONE = np.float32(1.2)
-"""Radians; wider cones are filtered as this one."""
+_FEW_SAMPLES = 16  # fewer samples than this are taken for sources
+_SEARCH_GAP = 0.8  # distance between neighbouring taps of the search over the radius of its disk
+_BLUR = np.float32(1.5)  # A mip level is used up to a tap distance of this many of its pixels
+_WIDEST_CONE = np.float32(1.2)  # radians; wider cones are filtered as this one
 _GOLDEN_ANGLE = 2.399963
 """Radians; rounded, and kept so: `core.directions.GOLDEN_ANGLE` would change results in the last bits."""
-_MIN_ALPHA = 1e-4
-"""Alpha below which a texel blocks nothing."""
+_MIN_ALPHA = 1e-4  # alpha below which a texel blocks nothing
 
 
 @dataclass(frozen=True)

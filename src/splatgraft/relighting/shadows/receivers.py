@@ -25,30 +25,22 @@ from splatgraft.relighting.shadows.scene_ratio import (
 
 RIM = 2.4
 """Standard deviations; beyond, a Gaussian's alpha is below 0.05."""
-_STEPS = (-RIM, -RIM / 2, 0.0, RIM / 2, RIM)
-"""Standard deviations of the points along a line."""
+_STEPS = (-RIM, -RIM / 2, 0.0, RIM / 2, RIM)  # standard deviations of the points along a line
 _LINES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.7, 0.7], [0.7, -0.7]])
 """Directions of lines, along the widest and the second widest axis."""
 
 # which receivers are split, and how far an edge is corrected
-_MAX_SPLITS = 12
-"""Most splits of one Gaussian and its pieces, one after another; set by hand."""
-_BROAD = 0.1
-"""Object radii (standard deviation): ambient light is averaged over wider Gaussians alone; set by hand."""
-_FINEST = 0.02
-"""Object radii (standard deviation): no piece gets narrower; set by hand."""
-_VARIATION = 0.003
-"""Share of light times alpha below which a Gaussian is not split, small as many overlap; set by hand."""
-_FAINTEST = 0.05
-"""Opacity below which a Gaussian is not split and gets no slope; set by hand."""
+_MAX_SPLITS = 12  # most splits of one Gaussian and its pieces, one after another; set by hand
+_BROAD = 0.1  # object radii (standard deviation): ambient light is averaged over wider Gaussians alone; set by hand
+_FINEST = 0.02  # object radii (standard deviation): no piece gets narrower; set by hand
+_VARIATION = 0.003  # share of light times alpha below which a Gaussian is not split, small as many overlap; set by hand
+_FAINTEST = 0.05  # opacity below which a Gaussian is not split and gets no slope; set by hand
 _SHOWS_BEHIND = 1.2
 """Standard deviations. Splats are blended in the order of their centres, so what is visible of one among others
 lies behind its centre, seen from the camera; without this an edge appears too far from all cameras. Measured on
 planes: 1.0 for opaque ones side by side, 1.4 to 2 for the pieces of split ones, of which many overlap."""
-_NARROWEST = 0.25
-"""Share of the finest width that is split: narrower Gaussians get no slope; set by hand."""
-_EDGE = 0.02
-"""Share of light by which rim and centre differ at an edge; a rim shows a twentieth of it; set by hand."""
+_NARROWEST = 0.25  # share of the finest width that is split: narrower Gaussians get no slope; set by hand
+_EDGE = 0.02  # share of light by which rim and centre differ at an edge; a rim shows a twentieth of it; set by hand
 
 
 @dataclass(frozen=True)
@@ -290,12 +282,9 @@ def _widest(gaussians: Gaussians) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "
 
 
 # the layer around a receiver
-_LAYER_NEIGHBOURS = 16
-"""Gaussians that form the layer around one, as for its normal."""
-_LEVEL_NEIGHBOURS = 48
-"""Gaussians over whose heights the middle is taken."""
-_LAYER_DEVIATIONS = 3.0
-"""Standard deviations of the layer's height between its middle and its top."""
+_LAYER_NEIGHBOURS = 16  # gaussians that form the layer around one, as for its normal
+_LEVEL_NEIGHBOURS = 48  # gaussians over whose heights the middle is taken
+_LAYER_DEVIATIONS = 3.0  # standard deviations of the layer's height between its middle and its top
 
 
 def above_layer(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

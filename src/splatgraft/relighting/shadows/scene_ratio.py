@@ -27,37 +27,28 @@ from splatgraft.relighting.shadows.shadow_maps import (
 )
 
 # shadow maps of objects and scenes; set by hand
-_SOURCE_SIZE = 512
-"""Pixels, a multiple of 16: width of a map of a source sample; set by hand."""
+_SOURCE_SIZE = 512  # pixels, a multiple of 16: width of a map of a source sample; set by hand
 AMBIENT_SIZE = 256
 """Pixels, a multiple of 16: width of a map of an ambient sample; set by hand."""
 _OBJECT_BIAS = (2.0, 1.0)
 """Pixels, for sources and for ambient light: nearer occluders are the receiver's own surface; set by hand."""
-_SELF_BIAS = (2.5, 2.0)
-"""The same for an object's shadow on itself."""
-_SCENE_BIAS = (2.5, 1.5)
-"""The same for the scene's shadow on itself and on objects."""
-_SELF_AMBIENT = 1 / 3
-"""Share of an ambient sample that still arrives where the object itself blocks it; set by hand."""
-_SCENE_AMBIENT = 0.5
-"""Share of an ambient sample that still arrives where the scene blocks it; set by hand."""
-_BLOCKERS_AROUND = 1.5
-"""Radii of the region within which the scene's Gaussians block light; set by hand."""
+_SELF_BIAS = (2.5, 2.0)  # the same for an object's shadow on itself
+_SCENE_BIAS = (2.5, 1.5)  # the same for the scene's shadow on itself and on objects
+_SELF_AMBIENT = 1 / 3  # share of an ambient sample that still arrives where the object itself blocks it; set by hand
+_SCENE_AMBIENT = 0.5  # share of an ambient sample that still arrives where the scene blocks it; set by hand
+_BLOCKERS_AROUND = 1.5  # radii of the region within which the scene's Gaussians block light; set by hand
 _MAX_ALBEDO = 0.8
 """Most albedo of an object: its unlit side is no brighter than the light on it allows, whatever light it was
 captured in; fresh snow and white paint have about this."""
-_NEAREST_SOURCE = 1.5
-"""Object radii; a nearer source counts as this far from the object's middle; set by hand."""
+_NEAREST_SOURCE = 1.5  # object radii; a nearer source counts as this far from the object's middle; set by hand
 
 # limits of shadow and bounce; set by hand
 _MIN_CHANGE = 0.004
 """Share of light; smaller changes become 0, full from three times this on. Half an 8-bit step of a mid grey."""
 DARKEST = 0.04
 """Share of light that every shadow leaves: light that no sample follows; set by hand."""
-_NEAR_REACH = 3.5
-"""Object radii within which ambient shadow and bounce are computed; set by hand."""
-_WIDEST_CONE = 1.2
-"""Radians; wider cones of a source reach as far aside as this one; set by hand."""
+_NEAR_REACH = 3.5  # object radii within which ambient shadow and bounce are computed; set by hand
+_WIDEST_CONE = 1.2  # radians; wider cones of a source reach as far aside as this one; set by hand
 
 
 @dataclass(frozen=True)

@@ -23,26 +23,16 @@ FAR = np.float32(1e30)
 """Depth of a texel where less than half of the light is blocked."""
 
 # compiled into the kernels; all set by hand
-_BINS = 4096
-"""Depth bins of the counting sort."""
-_FAINTEST = np.float32(0.01)
-"""Alpha below which a splat is cut off."""
-_CUTOFF = np.float32(3.04)
-"""Standard deviations, where a splat of opacity 1 falls to `_FAINTEST`."""
-_SPENT = np.float32(0.02)
-"""Transmittance below which a tile of pixels is finished."""
-_HALF = np.float32(0.5)
-"""Transmittance at which a texel's first depth is taken."""
-_MAX_ALPHA = np.float32(0.99)
-"""Largest alpha of one splat in one pixel, as in 3DGS."""
-_DILATION = np.float32(0.15)
-"""Pixels squared, added to the variance of a splat's footprint against aliasing."""
-_LIFT = np.float32(1.5)
-"""Pixels; a receiver is looked up this far above its surface, along the normal."""
-_NEAREST_TO_LIGHT = np.float32(0.05)
-"""Share of a near light's distance; occluders nearer to it are left out."""
-_FLATTEST = np.float32(0.2)
-"""Cosine of incidence below which the slope-dependent bias grows no further."""
+_BINS = 4096  # depth bins of the counting sort
+_FAINTEST = np.float32(0.01)  # alpha below which a splat is cut off
+_CUTOFF = np.float32(3.04)  # standard deviations, where a splat of opacity 1 falls to `_FAINTEST`
+_SPENT = np.float32(0.02)  # transmittance below which a tile of pixels is finished
+_HALF = np.float32(0.5)  # transmittance at which a texel's first depth is taken
+_MAX_ALPHA = np.float32(0.99)  # largest alpha of one splat in one pixel, as in 3DGS
+_DILATION = np.float32(0.15)  # pixels squared, added to the variance of a splat's footprint against aliasing
+_LIFT = np.float32(1.5)  # pixels; a receiver is looked up this far above its surface, along the normal
+_NEAREST_TO_LIGHT = np.float32(0.05)  # share of a near light's distance; occluders nearer to it are left out
+_FLATTEST = np.float32(0.2)  # cosine of incidence below which the slope-dependent bias grows no further
 
 
 @dataclass(frozen=True)

@@ -30,16 +30,11 @@ GAMMA = 2.2
 """Exponent of sRGB, in which Gaussians are blended, as a power law."""
 
 # set by hand
-_LONGEST_PX = 512
-"""Longest side of a view, cut to the shadow; wider ones are reduced."""
-_MARGIN = 0.25
-"""Share of its size that a view reaches beyond the shadow on each side."""
-_CHANGED = 0.05
-"""Change of light from which a receiver or a pixel counts as shadowed; fainter changes are smooth."""
-_BESIDE_PX = 4
-"""Pixels around a shadowed pixel that count too; pixels from the end of a surface that do not."""
-_RECEIVING = 0.1
-"""Share of a pixel that receivers must make up, there and around it."""
+_LONGEST_PX = 512  # longest side of a view, cut to the shadow; wider ones are reduced
+_MARGIN = 0.25  # share of its size that a view reaches beyond the shadow on each side
+_CHANGED = 0.05  # change of light from which a receiver or a pixel counts as shadowed; fainter changes are smooth
+_BESIDE_PX = 4  # pixels around a shadowed pixel that count too; pixels from the end of a surface that do not
+_RECEIVING = 0.1  # share of a pixel that receivers must make up, there and around it
 
 
 @dataclass(frozen=True)
@@ -223,10 +218,8 @@ def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
     return F.normalize(camera.rays() @ camera.world_from_camera[0, :3, :3].T, dim=-1)
 
 
-_REACH = np.float32(3)
-"""Standard deviations by which a Gaussian's centre may lie outside the picture."""
-_NEAREST = np.float32(1e-6)
-"""World units; a depth below is taken for this one."""
+_REACH = np.float32(3)  # standard deviations by which a Gaussian's centre may lie outside the picture
+_NEAREST = np.float32(1e-6)  # world units; a depth below is taken for this one
 
 
 def gaussians_in_view(

@@ -20,17 +20,13 @@ from splatgraft.relighting.shadows.surface_views import GAMMA, SurfaceView, blen
 from splatgraft.rendering import ViewOperator
 
 # the solver; set by hand
-_ROUNDS = 5
-"""Iterations."""
+_ROUNDS = 5  # iterations
 _NARROWEST_PX = 0.5
 """Widest standard deviation in pixels below which a Gaussian keeps what it has: a reduced view draws it wider than
 it is, and so in the wrong place. Measured on planes: at 0.3 the fit makes shadows worse, at 0.6 better."""
-_RECEIVING = 0.5
-"""Share of a pixel that receivers must make up."""
-_MAX_SLOPE = 0.9
-"""Most share of a value that a view direction takes away."""
-_MIN_WEIGHT = 0.05
-"""Pixels; receivers with less weight in all views together keep what they have."""
+_RECEIVING = 0.5  # share of a pixel that receivers must make up
+_MAX_SLOPE = 0.9  # most share of a value that a view direction takes away
+_MIN_WEIGHT = 0.05  # pixels; receivers with less weight in all views together keep what they have
 
 
 @dataclass(frozen=True)

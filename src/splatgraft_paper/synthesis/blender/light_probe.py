@@ -9,12 +9,10 @@ import scene_builder
 from mathutils import Vector
 
 WIDTH, HEIGHT = 128, 64
-_SAMPLES = 64
-"""Light paths per pixel of the panorama."""
+_SAMPLES = 64  # light paths per pixel of the panorama
 _DISC_MARGIN = 2.5 * math.pi / HEIGHT
 """Radians around the sun's disc, 2.5 pixels: the pixel filter spreads the disc that far."""
-_SUN_PIXELS = 24
-"""Width of the image from which the sky's sun is measured."""
+_SUN_PIXELS = 24  # width of the image from which the sky's sun is measured
 
 
 def measure(scene, world, point, things):

@@ -3,8 +3,7 @@
 import bpy
 import numpy as np
 
-_MAX_ROUNDS = 60
-"""Rounds of rejection sampling."""
+_MAX_ROUNDS = 60  # rounds of rejection sampling
 
 
 def sample_points(things, sampling, seed):

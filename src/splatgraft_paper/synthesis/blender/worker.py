@@ -19,12 +19,9 @@ import passes
 import scene_builder
 import surface_points
 
-_LUMA = np.array([0.2126, 0.7152, 0.0722])
-"""Rec. 709."""
-_MID_GREY = 0.22
-"""Linear value to which the exposure brings the geometric mean of luminance; set by hand."""
-_HIGHLIGHT = 1.3
-"""Largest linear value of the 97th percentile of luminance after exposure; set by hand."""
+_LUMA = np.array([0.2126, 0.7152, 0.0722])  # rec. 709.
+_MID_GREY = 0.22  # linear value to which the exposure brings the geometric mean of luminance; set by hand
+_HIGHLIGHT = 1.3  # largest linear value of the 97th percentile of luminance after exposure; set by hand
 
 
 def _populate(job):

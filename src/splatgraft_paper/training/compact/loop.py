@@ -20,10 +20,8 @@ from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
 from splatgraft_paper.training.compact.pairs import CompactPairs, augment, batch_inputs
 from splatgraft_paper.training.loop import LoopOptions, Validation
 
-_BETAS = (0.9, 0.99)
-"""Decay of AdamW's moments."""
-_FINAL_RATE = 0.02
-"""Learning rate at the last step over the largest."""
+_BETAS = (0.9, 0.99)  # decay of AdamW's moments
+_FINAL_RATE = 0.02  # learning rate at the last step over the largest
 _SHEET_ROWS = 12
 
 

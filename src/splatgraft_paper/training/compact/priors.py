@@ -45,12 +45,10 @@ _MAX_SPREAD_DEG, _MAX_ANGLE_DEG = 20.0, 30.0
 """The standard deviation of a light's error in direction is drawn from 0 up to the first; the largest error."""
 _LEVEL_DEVIATION, _MAX_LEVEL = 0.35, 1.4
 """Standard deviation of the log error of a light's overall level, and the largest one. Set by hand, as all below."""
-_TINT_DEVIATION = 0.06
-"""Standard deviation of the log error of each colour channel."""
+_TINT_DEVIATION = 0.06  # standard deviation of the log error of each colour channel
 _MAX_STRENGTH_FACTOR, _STRENGTH_DEVIATION = 4.0, 0.45
 """Largest factor between sources and ambient light, either way; standard deviation in units of its log."""
-_MISSED_SHARE = 0.05
-"""Probability that a source is missed."""
+_MISSED_SHARE = 0.05  # probability that a source is missed
 _COVERAGE, _CONFIDENCE = (0.45, 1.0), (0.6, 1.0)
 """Ranges of the coverage of the environment, and of a source's confidence."""
 _UNCERTAINTY_OFFSET_DEG, _UNCERTAINTY_FACTOR = 2.0, (0.7, 1.3)
@@ -58,8 +56,7 @@ _UNCERTAINTY_OFFSET_DEG, _UNCERTAINTY_FACTOR = 2.0, (0.7, 1.3)
 _REACH, _REGION_MARGIN = 8.0, 1.2
 """Extent of the scene's shadow maps in radii of the object, as in `RelightOptions`; radius of the region of occluders
 over it."""
-_OFFSET_M = 0.004
-"""Metres by which a point is raised along its normal, against self-shadowing by its own surfels."""
+_OFFSET_M = 0.004  # metres by which a point is raised along its normal, against self-shadowing by its own surfels
 _NORMAL_NOISE_DEG, _NOISE_PX = 12.0, 10
 """Error of normals, as on Gaussians, and the pixels over which it is alike."""
 _MIN_COVERAGE = 0.02
