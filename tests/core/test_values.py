@@ -130,6 +130,12 @@ def test_spread_cameras_are_evenly_spaced(count, expected):
     assert cameras.spread(count).names == tuple(cameras.names[i] for i in expected)
 
 
+def test_look_at_stays_on_the_device_of_its_points():
+    # torch's device without data stands for a GPU
+    poses = look_at(*(torch.zeros(shape, device="meta") for shape in ((2, 3), (3,), (3,))))
+    assert (poses.device.type, poses.shape) == ("meta", (2, 4, 4))
+
+
 def shell(center, radius, *, count=1000, scale=0.01, opacity=0.9):
     """Small opaque Gaussians spread evenly over a sphere."""
     return Gaussians(

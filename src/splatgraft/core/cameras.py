@@ -170,7 +170,7 @@ def look_at(eye: Float[Tensor, "v 3"], target: Float[Tensor, "3"], up: Float[Ten
     forward = torch.nn.functional.normalize(target - eye, dim=-1)
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up.expand_as(forward)), dim=-1)
     down = torch.linalg.cross(forward, right)
-    out = torch.eye(4, dtype=eye.dtype).repeat(len(eye), 1, 1)
+    out = torch.eye(4, dtype=eye.dtype, device=eye.device).repeat(len(eye), 1, 1)
     out[:, :3, :3] = torch.stack([right, down, forward], -1)
     out[:, :3, 3] = eye
     return out
