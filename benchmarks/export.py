@@ -24,7 +24,7 @@ from splatgraft.folders.export_source import read_export_source
 from splatgraft.formats import read_gaussians
 from splatgraft.rendering import render
 
-FORMATS = (".ply", ".compressed.ply", ".sog", ".spz", "3.spz", "2.spz", ".splat", ".glb", ".usdz", ".html")
+FORMATS = (".ply", ".compressed.ply", ".sog", ".spz", "3.spz", ".splat", ".glb", ".usdz", ".html")
 VIEWS, LONGEST_PX, PAGE_PX = 8, 640, 960
 _ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist")
 

@@ -40,7 +40,7 @@ class ExportOptions:
     """Frame of a scene. capture: as in the project; world: upright and in metres, as far as they are known; auto: world
     for .glb and .usdz, which ask for it, else capture."""
     spz_version: int = 4
-    """Version of a .spz: 4, or 3 or 2 for programs that do not read it yet."""
+    """Version of a .spz: 4, or 3 for programs that do not read 4 yet."""
     sh_degree: int = 3
     """Highest SH degree that is written, 0 to 3: files of lower ones are smaller, and highlights move less."""
     width: int | None = None

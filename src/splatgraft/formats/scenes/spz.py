@@ -1,4 +1,4 @@
-"""Reads .spz scenes (Niantic, versions 2 to 4) and writes them: quantised arrays, one per field.
+"""Reads .spz scenes (Niantic, versions 2 to 4) and writes versions 3 and 4: quantised arrays, one per field.
 
 Layout of Niantic's load-spz.cc: a header, then the arrays; in one gzip stream (versions 2 and 3), or plain with a table
 of sizes and one zstd stream per array (version 4). Axes are right-up-back, ours and a .ply's are right-down-front.
@@ -133,12 +133,9 @@ def _four_bytes_unpacked(rotations: UInt8[Tensor, "n 4"]) -> Float[Tensor, "n 4"
 
 
 def write_spz(path: Path, gaussians: Gaussians, _: SceneMetadata = SceneMetadata(), *, version: int = 4) -> None:
-    """Write positions in 24 bits of the scene's extent, the rest in 8 bits.
-
-    Version 4 has zstd streams, 3 one gzip stream, and 2 rotations in 3 bytes, for the oldest readers.
-    """
-    if version not in (2, 3, 4):
-        raise ValueError(f"{path}: expected .spz version 2, 3 or 4 to write, found {version}")
+    """Write positions in 24 bits of the extent, the rest in 8 bits, as zstd streams (4) or one gzip stream (3)."""
+    if version not in (3, 4):
+        raise ValueError(f"{path}: expected .spz version 3 or 4 to write, found {version}")
     g = change_axes(writable(path, gaussians, least=0), rdf_from(AXES))
     extent = float(g.means.abs().max()) if g.count else 1.0
     bits = max(b for b in range(-64, 24) if b < -60 or extent * 2.0**b <= 0x7FFFFF)
@@ -152,7 +149,7 @@ def write_spz(path: Path, gaussians: Gaussians, _: SceneMetadata = SceneMetadata
             bytes_from_unit(g.opacities).numpy(),
             bytes_from_unit(g.sh[:, 0] * _COLOR_SCALE + 0.5).numpy(),
             ((g.log_scales + 10) * 16).round().clamp(0, 255).to(torch.uint8).numpy(),
-            _three_bytes(g.quaternions) if version == 2 else _four_bytes(g.quaternions),
+            _four_bytes(g.quaternions),
             (g.sh[:, 1:] * 128 + 128).round().clamp(0, 255).to(torch.uint8).numpy(),
         )
     ]
@@ -168,13 +165,6 @@ def write_spz(path: Path, gaussians: Gaussians, _: SceneMetadata = SceneMetadata
         parts = [deflate.compress(part) for part in (_HEADER.pack(*head, 0), *arrays)] + [deflate.flush()]
     with atomic_write(path) as stream:
         stream.write(b"".join(parts))
-
-
-def _three_bytes(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
-    """x, y, z of a unit quaternion with w >= 0."""
-    unit = torch.nn.functional.normalize(quaternions, dim=-1)
-    xyz = torch.where(unit[:, :1] < 0, -unit, unit)[:, 1:]
-    return ((xyz + 1) * 127.5).round().clamp(0, 255).to(torch.uint8).numpy()
 
 
 def _four_bytes(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
