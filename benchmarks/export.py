@@ -24,7 +24,7 @@ from splatgraft.folders.export_source import read_export_source
 from splatgraft.formats import read_gaussians
 from splatgraft.rendering import render
 
-FORMATS = (".ply", ".compressed.ply", ".sog", ".spz", "3.spz", ".splat", ".glb", ".usdz", ".html")
+FORMATS = (".ply", ".compressed.ply", ".sog", ".spz", "3.spz", ".splat", ".glb", ".html")
 VIEWS, LONGEST_PX, PAGE_PX = 8, 640, 960
 _ARGUMENTS = ("--no-sandbox", "--use-gl=angle", "--use-angle=gl-egl", "--ignore-gpu-blocklist")
 
@@ -85,7 +85,7 @@ def main() -> None:
             if name == ".html" and "--chromium" in sys.argv:
                 value, opened = page_psnr(path, source)
                 quality = f"{value:.1f} in Chromium, drawn after {opened:.1f} s"
-            elif name not in (".html", ".usdz"):
+            elif name != ".html":
                 value = mean_psnr(read_gaussians(path), truth, cameras)
                 quality = "exact" if value > 100 else f"{value:.1f}"
             label = f".spz, version {version}" if name.endswith(".spz") else name

@@ -24,7 +24,7 @@ class Export:
     """A scene file, a folder with scene.ply, or a project: its folder or project.toml."""
     to: Path
     """The file to write; its suffix names the format: .html (one page with a viewer), .sog, .spz, .compressed.ply,
-    .ply, .splat, .glb, .usdz; .png or .jpg (the page's first view); .mp4, .gif or .webp (a turntable)."""
+    .ply, .splat, .glb; .png or .jpg (the page's first view); .mp4, .gif or .webp (a turntable)."""
     page: Literal["viewer", "report"] = "viewer"
     """What an .html holds: the scene with a viewer, or the project's report with all its pictures."""
     cameras: Path | None = None

@@ -36,7 +36,6 @@ SHARE_KINDS: dict[str, ShareKind] = {
     "Scene, exact (.ply)": ShareKind(".ply"),
     "Scene, old viewers (.splat)": ShareKind(".splat"),
     "Scene, glTF (.glb)": ShareKind(".glb"),
-    "Scene, OpenUSD (.usdz)": ShareKind(".usdz", module="pxr"),
 }
 """By the name that a user chooses."""
 

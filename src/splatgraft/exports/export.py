@@ -16,7 +16,7 @@ from splatgraft.formats import WRITTEN_SCENE_SUFFIXES, scene_suffix, write_gauss
 from splatgraft.formats.scenes.spz import write_spz
 from splatgraft.runtime.progress import Progress, silent
 
-_WORLD_SUFFIXES = (".glb", ".usdz")  # formats whose y points up and whose unit is a metre
+_WORLD_SUFFIX = ".glb"  # its y points up and its unit is a metre
 
 _WIDTH = 1280
 _MIN_WIDTH = 16  # pixels
@@ -38,7 +38,7 @@ class ExportOptions:
     Gaussians that darken what lies behind them as the shadow does; object-with-shadow: both, for a compositor."""
     frame: Literal["auto", "capture", "world"] = "auto"
     """Frame of a scene. capture: as in the project; world: upright and in metres, as far as they are known; auto: world
-    for .glb and .usdz, which ask for it, else capture."""
+    for .glb, which asks for it, else capture."""
     spz_version: int = 4
     """Version of a .spz: 4, or 3 for programs that do not read 4 yet."""
     sh_degree: int = 3
@@ -99,7 +99,7 @@ def export_scene(
 
 def _write_scene(to: Path, gaussians: Gaussians, source: ExportSource, options: ExportOptions) -> tuple[str, ...]:
     metadata, suffix, said = source.metadata, scene_suffix(to), ()
-    if options.frame == "world" or (options.frame == "auto" and suffix in _WORLD_SUFFIXES):
+    if options.frame == "world" or (options.frame == "auto" and suffix == _WORLD_SUFFIX):
         world_from_capture, metadata, said = upright(source)
         gaussians = world_from_capture.gaussians(gaussians)
     if suffix == ".spz":

@@ -14,7 +14,6 @@ from splatgraft.formats.scenes.axes import with_axes
 from splatgraft.formats.scenes.compressed_ply import COMPRESSED_PLY, write_compressed_ply
 from splatgraft.formats.scenes.gaussian_glb import read_gaussian_glb, write_gaussian_glb
 from splatgraft.formats.scenes.gaussian_ply import read_gaussian_ply, write_gaussian_ply
-from splatgraft.formats.scenes.gaussian_usd import write_gaussian_usdz
 from splatgraft.formats.scenes.ksplat import read_ksplat
 from splatgraft.formats.scenes.ply import read_points, write_points
 from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
@@ -59,7 +58,6 @@ _WRITERS = {
     ".spz": write_spz,
     ".splat": write_splat,
     ".glb": write_gaussian_glb,
-    ".usdz": write_gaussian_usdz,
 }
 
 SCENE_SUFFIXES = tuple(_READERS)
@@ -124,7 +122,7 @@ def write_gaussians(path: Path | str, gaussians: Gaussians, *, metadata: SceneMe
     """Write a scene in the format of the suffix; the file appears whole or not at all.
 
     Args:
-        path: A file that ends in .ply (exact), .glb or .usdz (float32), .sog, .spz, .compressed.ply or .splat
+        path: A file that ends in .ply (exact), .glb (float32), .sog, .spz, .compressed.ply or .splat
             (quantised; .sog and .compressed.ply change the order, .splat keeps band 0 of the colour only).
         gaussians: The scene, on the CPU.
         metadata: What is known of its frame; left out of .spz and .splat, which have no room for it.

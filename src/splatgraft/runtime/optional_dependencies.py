@@ -18,7 +18,6 @@ OPTIONAL_DEPENDENCIES = {
     "cuda": OptionalDependency("splatting kernels for NVIDIA GPUs", {"gsplat": "gsplat", "packaging": "packaging"}),
     "sfm": OptionalDependency("poses for photos and videos that have none", {"pycolmap": "pycolmap"}),
     "heic": OptionalDependency("photos in HEIC, as iPhones write them", {"pillow_heif": "pillow-heif"}),
-    "usd": OptionalDependency(".usdz scenes (OpenUSD)", {"pxr": "usd-core"}),
     "spz": OptionalDependency(".spz scenes of version 4", {"zstandard": "zstandard"}),
     "flux": OptionalDependency(
         "the paper's image model and its training",
