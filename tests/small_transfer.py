@@ -9,7 +9,7 @@ from tiny_project import ball, photograph, plane
 
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.formats import write_gaussians
-from splatgraft.formats.metric_scale import MetricScale, write_scale
+from splatgraft.project.metric_scale import MetricScale, write_scale
 
 
 def darkened(gaussians: Gaussians, factor: float) -> Gaussians:

@@ -12,7 +12,7 @@ from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.render import Render
 from splatgraft.core.similarity import Similarity
 from splatgraft.folders.capture_files import camera_files
-from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
+from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.project.record import input_entries
 from splatgraft.project.step import Step
 from splatgraft.workflow.flow import STEPS

@@ -22,7 +22,7 @@ from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.formats.captures.exif import exif_of, read_exposure
-from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
+from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
 
 
 def room(gray: float) -> Gaussians:

@@ -10,7 +10,7 @@ from tiny_project import ball, photograph, plane
 from splatgraft.commands.steps.render import Render
 from splatgraft.core.gaussians import concatenate
 from splatgraft.formats import write_gaussians
-from splatgraft.formats.gaussian_flags import write_flags
+from splatgraft.project.gaussian_flags import write_flags
 from splatgraft.project.step import job_of, perform
 from splatgraft.relighting import Light, LightSource, light_to_json
 from splatgraft.relighting.light.light import light_confidence

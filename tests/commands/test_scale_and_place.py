@@ -12,8 +12,8 @@ from splatgraft.cli import main
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.gaussians import concatenate
 from splatgraft.formats import read_capture, write_gaussians
-from splatgraft.formats.metric_scale import read_scale
-from splatgraft.formats.placement import read_placement
+from splatgraft.project.metric_scale import read_scale
+from splatgraft.project.placement import read_placement
 
 
 @pytest.fixture

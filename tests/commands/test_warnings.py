@@ -14,7 +14,7 @@ from tiny_project import ball, photograph, plane, write_project
 
 from splatgraft.cli import main
 from splatgraft.core.similarity import Similarity
-from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
+from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.project.record import read_record
 from splatgraft.project.step import Context, Inputs, perform
 from splatgraft.runtime.console import Console

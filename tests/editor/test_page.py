@@ -20,7 +20,7 @@ from splatgraft.editor.page.page import Page
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
 from splatgraft.editor.state_files import read_state
-from splatgraft.formats.metric_scale import MetricScale, read_scale, write_scale
+from splatgraft.project.metric_scale import MetricScale, read_scale, write_scale
 from splatgraft.relighting import LayerWeights, Light, LightSource
 from splatgraft.relighting.light.light import fit_ambient
 

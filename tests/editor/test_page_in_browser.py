@@ -33,7 +33,7 @@ from splatgraft.editor.placement import rescale
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
-from splatgraft.formats.placement import read_placement
+from splatgraft.project.placement import read_placement
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LightSource, light_to_json
 from splatgraft.relighting.light.sun import SET_BY_HAND

@@ -13,7 +13,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.editor.project import Project, RenderedViews
 from splatgraft.editor.session import Session
 from splatgraft.formats import read_cameras, read_gaussians
-from splatgraft.formats.placement import read_placement
+from splatgraft.project.placement import read_placement
 from splatgraft.project.record import read_record
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.runtime.settings import read_toml

@@ -19,8 +19,8 @@ from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState
 from splatgraft.editor.state_files import read_state, state_files, write_state
-from splatgraft.formats.placement import ObjectPlacement
-from splatgraft.formats.prompts import read_prompts
+from splatgraft.project.placement import ObjectPlacement
+from splatgraft.project.prompts import read_prompts
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LayerWeights, light_to_json
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient

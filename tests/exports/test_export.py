@@ -23,7 +23,7 @@ from splatgraft.exports.pictures import write_video
 from splatgraft.exports.shadow_layer import shadow_layer
 from splatgraft.folders.export_source import read_export_source
 from splatgraft.formats import SceneMetadata, read_gaussians, read_scene, write_gaussians
-from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
+from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.rendering import render
 
 

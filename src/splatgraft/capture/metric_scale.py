@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.formats.metric_scale import MetricScale
+from splatgraft.project.metric_scale import MetricScale
 from splatgraft.runtime.progress import Progress, silent
 
 _DICTIONARIES = (

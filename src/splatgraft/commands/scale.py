@@ -6,7 +6,7 @@ from pathlib import Path
 from splatgraft.capture import scale_from_length, scale_from_marker
 from splatgraft.folders.picture_points import point_in_world
 from splatgraft.formats import read_capture, read_gaussians
-from splatgraft.formats.metric_scale import MetricScale, write_scale
+from splatgraft.project.metric_scale import MetricScale, write_scale
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.lazy_sequence import LazySequence

@@ -20,9 +20,9 @@ from torch import Tensor
 
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.state import EditState
-from splatgraft.formats.placement import ObjectPlacement
-from splatgraft.formats.prompts import prompts_from_json, prompts_to_json
 from splatgraft.project.layout import EDITOR_FOLDER
+from splatgraft.project.placement import ObjectPlacement
+from splatgraft.project.prompts import prompts_from_json, prompts_to_json
 from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
 from splatgraft.runtime.files import atomic_write
 

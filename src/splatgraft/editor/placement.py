@@ -17,7 +17,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.rotations import quaternion_from_rotation, rotation_between, rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.state import check_height_cm
-from splatgraft.formats.metric_scale import MetricScale
+from splatgraft.project.metric_scale import MetricScale
 
 Triple = tuple[float, float, float]
 

@@ -21,8 +21,8 @@ from splatgraft.editor.project import ProjectFiles
 from splatgraft.editor.scene_sample import SceneSample, read_sample
 from splatgraft.editor.state import EditState
 from splatgraft.formats import read_cameras, read_capture, read_gaussians
-from splatgraft.formats.gaussian_flags import read_flags
-from splatgraft.formats.placement import ObjectPlacement
+from splatgraft.project.gaussian_flags import read_flags
+from splatgraft.project.placement import ObjectPlacement
 from splatgraft.relighting import SourceScene
 
 _LARGE_BYTES = 12_000_000

@@ -21,9 +21,9 @@ from splatgraft.editor.relit_preview import RelitPreview
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState, check_height_cm, check_state
 from splatgraft.editor.state_files import as_written, read_state, state_files, write_state
-from splatgraft.formats.metric_scale import MetricScale, read_scale, write_scale
-from splatgraft.formats.placement import ObjectPlacement, read_placement
 from splatgraft.project.layout import EDITOR_FOLDER, Side
+from splatgraft.project.metric_scale import MetricScale, read_scale, write_scale
+from splatgraft.project.placement import ObjectPlacement, read_placement
 from splatgraft.segmentation import Box, add_correction, apply_corrections
 
 Stamps = tuple[tuple[int, int] | None, ...]

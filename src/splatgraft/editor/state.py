@@ -10,8 +10,8 @@ from torch import Tensor
 
 from splatgraft.core.prompts import ViewPrompt
 from splatgraft.folders.object_masks import MaskSource
-from splatgraft.formats.placement import ObjectPlacement
 from splatgraft.harmonization import HARMONIZERS
+from splatgraft.project.placement import ObjectPlacement
 from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
 from splatgraft.segmentation import Keep
 

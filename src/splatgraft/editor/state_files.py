@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from splatgraft.editor.state import BoxNumbers, EditState, check_state
-from splatgraft.formats.gaussian_flags import read_corrections, write_flags
-from splatgraft.formats.placement import Placement, read_placement, write_placement
-from splatgraft.formats.prompts import read_prompts, write_prompts
+from splatgraft.project.gaussian_flags import read_corrections, write_flags
 from splatgraft.project.layout import ERASED_FILE, LIGHT_FILE, PLACEMENT_FILE
+from splatgraft.project.placement import Placement, read_placement, write_placement
+from splatgraft.project.prompts import read_prompts, write_prompts
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
 from splatgraft.runtime.files import atomic_write

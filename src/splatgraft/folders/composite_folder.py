@@ -15,9 +15,9 @@ from torch import Tensor
 from splatgraft.composition import Composite, compose
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats import read_gaussians, write_gaussians
-from splatgraft.formats.gaussian_flags import read_flags, write_flags
-from splatgraft.formats.placement import Placement, read_placement, write_placement
-from splatgraft.project.layout import IS_GUESSED_FILE, IS_OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
+from splatgraft.project.gaussian_flags import read_flags, write_flags
+from splatgraft.project.layout import ERASED_FILE, IS_GUESSED_FILE, IS_OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
+from splatgraft.project.placement import Placement, read_placement, write_placement
 
 _ONE_SIDED = 0.25
 """Distance of what was guessed from the object's middle, over its radius, from which on one side is it; set by hand."""
@@ -26,7 +26,7 @@ _ONE_SIDED = 0.25
 def placement_files(path: Path) -> tuple[Path, ...]:
     """placement.json and all files that it names."""
     placement = read_placement(path)
-    erased = (path.parent / "erased.npy",) if placement.erased is not None else ()
+    erased = (path.parent / ERASED_FILE,) if placement.erased is not None else ()
     return (path, *erased, *(item.object_path for item in placement.objects if item.object_path is not None))
 
 

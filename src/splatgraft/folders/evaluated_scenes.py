@@ -17,7 +17,7 @@ from splatgraft.evaluation import ComparedView, Truth
 from splatgraft.folders.capture_files import capture_inputs
 from splatgraft.folders.composite_folder import guessed_gaussians, photographed_side
 from splatgraft.formats import read_cameras, read_gaussians, read_images
-from splatgraft.formats.gaussian_flags import read_selection
+from splatgraft.project.gaussian_flags import read_selection
 from splatgraft.project.layout import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
 from splatgraft.rendering import render
 from splatgraft.runtime.lazy_sequence import LazySequence

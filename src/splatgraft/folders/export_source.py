@@ -12,10 +12,8 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.exports.export_source import ExportSource
 from splatgraft.folders.composite_folder import guessed_gaussians, photographed_side
 from splatgraft.formats import is_scene, read_cameras, read_gaussians, read_scene
-from splatgraft.formats.gaussian_flags import read_selection
-from splatgraft.formats.metric_scale import read_scale
-from splatgraft.formats.placement import read_placement
 from splatgraft.formats.scenes.scene_file import SceneMetadata
+from splatgraft.project.gaussian_flags import read_selection
 from splatgraft.project.layout import (
     CAMERAS_FILE,
     IS_OBJECT_FILE,
@@ -24,6 +22,8 @@ from splatgraft.project.layout import (
     SCENE_FILE,
     Layout,
 )
+from splatgraft.project.metric_scale import read_scale
+from splatgraft.project.placement import read_placement
 
 
 def read_export_source(path: Path, *, cameras: Path | None = None) -> ExportSource:

@@ -1,1 +1,1 @@
-"""A project on disk: the folders of its results, what makes them stale, and how a step replaces one."""
+"""A project on disk: its files, the folders of its results, what makes them stale, and how a step replaces one."""

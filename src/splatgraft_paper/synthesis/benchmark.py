@@ -24,7 +24,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.similarity import Similarity
 from splatgraft.formats import read_capture, write_capture
-from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
+from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
 from splatgraft_paper.synthesis import objects
 from splatgraft_paper.synthesis.furniture import Palette, box, cabinet, placed, plant
 from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take

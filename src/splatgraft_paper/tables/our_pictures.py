@@ -15,8 +15,8 @@ from splatgraft.core.images import write_image
 from splatgraft.core.similarity import Similarity
 from splatgraft.folders.capture_files import camera_files
 from splatgraft.formats import read_cameras, read_gaussians, read_scene, write_cameras, write_gaussians
-from splatgraft.formats.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.project.layout import OBJECT_FILE, PLACEMENT_FILE
+from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.rendering import render

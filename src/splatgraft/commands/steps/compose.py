@@ -11,9 +11,9 @@ from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.composite_folder import composite_of, placement_files, write_composite
 from splatgraft.folders.picture_points import point_in_world
 from splatgraft.formats import read_cameras, read_gaussians, read_images
-from splatgraft.formats.metric_scale import MetricScale, read_scale, scale_path
-from splatgraft.formats.placement import ObjectPlacement, Placement, read_placement
 from splatgraft.project.layout import COVERAGE_FILE
+from splatgraft.project.metric_scale import MetricScale, read_scale, scale_path
+from splatgraft.project.placement import ObjectPlacement, Placement, read_placement
 from splatgraft.project.step import Context, Inputs
 from splatgraft.runtime.note import Note
 

@@ -13,9 +13,9 @@ from splatgraft.core.images import write_image
 from splatgraft.folders.capture_files import camera_files, read_luminance_scale
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
-from splatgraft.formats.gaussian_flags import write_flags
-from splatgraft.formats.placement import read_placement
+from splatgraft.project.gaussian_flags import write_flags
 from splatgraft.project.layout import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_PICTURE, LIGHT_TEXT_FILE, SCENE_FILE
+from splatgraft.project.placement import read_placement
 from splatgraft.project.step import Context, Inputs
 from splatgraft.relighting.gain import relight_by_gain
 from splatgraft.relighting.layers import LayerWeights, Relit

@@ -13,8 +13,8 @@ from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.view_folder import ViewFolder, file_stems
 from splatgraft.formats import read_cameras, read_gaussians, write_capture
-from splatgraft.formats.gaussian_flags import read_selection
 from splatgraft.harmonization import render_views
+from splatgraft.project.gaussian_flags import read_selection
 from splatgraft.project.layout import LIGHT_TEXT_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.relighting.light.light import light_confidence, light_from_json

@@ -31,9 +31,9 @@ from splatgraft.folders.object_masks import (
 )
 from splatgraft.folders.picture_points import prompts_by_view
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
-from splatgraft.formats.gaussian_flags import read_corrections, write_flags
-from splatgraft.formats.prompts import read_prompts
+from splatgraft.project.gaussian_flags import read_corrections, write_flags
 from splatgraft.project.layout import COVERAGE_FILE, IS_GUESSED_FILE, OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
+from splatgraft.project.prompts import read_prompts
 from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.lazy_sequence import LazySequence

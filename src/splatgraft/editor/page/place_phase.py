@@ -36,7 +36,7 @@ from splatgraft.editor.session import Session
 from splatgraft.editor.sky_dome import SkyDome
 from splatgraft.editor.state import check_numbers, check_state
 from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
-from splatgraft.formats.placement import ObjectPlacement
+from splatgraft.project.placement import ObjectPlacement
 from splatgraft.segmentation import Box
 
 _NO_NAMES: tuple[str, ...] = ("1",)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
-from splatgraft.formats.placement import ObjectPlacement, Placement, read_placement, write_placement
+from splatgraft.project.placement import ObjectPlacement, Placement, read_placement, write_placement
 
 
 def test_round_trip_is_bit_exact(tmp_path):

@@ -19,10 +19,10 @@ from torch import Tensor
 
 from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
-from splatgraft.formats.gaussian_flags import read_flags, write_flags
 from splatgraft.formats.json_file import array, excerpt, load, number, save
+from splatgraft.project.gaussian_flags import read_flags, write_flags
+from splatgraft.project.layout import ERASED_FILE
 
-_ERASED_FILE = "erased.npy"
 _DEFAULTS = {"object": None, "scale": 1.0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
 _RIGID = 1e-4  # largest entry of R R^T - I; accepts files with six digits, refuses a scale or shear in the matrix
 
@@ -70,8 +70,8 @@ def write_placement(path: Path, placement: Placement) -> None:
         entries.append(named | place)
     content: dict[str, Any] = {"objects": entries}
     if placement.erased is not None:
-        content["erased"] = _ERASED_FILE
-        write_flags(path.parent / _ERASED_FILE, placement.erased)
+        content["erased"] = ERASED_FILE
+        write_flags(path.parent / ERASED_FILE, placement.erased)
     save(path, content)
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from splatgraft.core.prompts import ViewPrompt
-from splatgraft.formats.prompts import read_prompts, write_prompts
+from splatgraft.project.prompts import read_prompts, write_prompts
 
 TEXT = """
 ["DSC_1.jpg"]
