@@ -19,16 +19,16 @@ class BoundingSphere:
     """A sphere around an object's Gaussians."""
 
     center: Float[Tensor, "3"]
-    """World units, in the frame of the Gaussians."""
+    """Centre, world units, in the frame of the Gaussians."""
     radius: float
-    """World units."""
+    """Radius, world units."""
 
 
 def bounding_sphere(gaussians: Gaussians) -> BoundingSphere:
-    """The sphere that holds 99% of the opaque Gaussians with one standard deviation of their width, plus 5%.
+    """Compute the sphere that holds 99% of the opaque Gaussians with one standard deviation of their width, plus 5%.
 
     Its centre is the middle between the 1st and the 99th percentile along each axis. Gaussians below an opacity of 0.1
-    are ignored unless all are.
+    are ignored, unless all are.
     """
     opaque = gaussians.opacities > _OPAQUE
     means = gaussians.means[opaque] if bool(opaque.any()) else gaussians.means

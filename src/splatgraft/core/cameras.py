@@ -16,19 +16,19 @@ class Cameras:
     """v pinhole cameras; OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
 
     world_from_camera: Float[Tensor, "v 4 4"]
-    """Rigid poses: a point in camera coordinates to world coordinates."""
+    """Rigid poses, from camera to world coordinates."""
     intrinsics: Float[Tensor, "v 3 3"]
-    """fx, fy, cx, cy in pixels in the usual places; no skew."""
+    """Camera matrices of fx, fy, cx, cy, pixels; no skew."""
     sizes: Int[Tensor, "v 2"]
     """Width and height of each image, pixels."""
     names: tuple[str, ...]
-    """One name per camera, unique; the image file's name where there is one."""
+    """Unique names of the cameras; the image file's name if there is one."""
 
     def __len__(self) -> int:
         return len(self.names)
 
     def __getitem__(self, which: int | slice | list[int] | Int[Tensor, "m"] | Bool[Tensor, "v"]) -> "Cameras":
-        """The chosen cameras; an integer gives a batch of one camera."""
+        """Select cameras; an integer gives a batch of one camera."""
         indices = torch.arange(len(self))[[which] if isinstance(which, int) else which]
         return Cameras(
             world_from_camera=self.world_from_camera[indices],
@@ -49,7 +49,7 @@ class Cameras:
     def width(self) -> int:
         """Image width that all share, pixels.
 
-        Raises: ValueError where sizes differ.
+        Raises: ValueError if sizes differ.
         """
         return self._shared_size(0)
 
@@ -57,7 +57,7 @@ class Cameras:
     def height(self) -> int:
         """Image height that all share, pixels.
 
-        Raises: ValueError where sizes differ.
+        Raises: ValueError if sizes differ.
         """
         return self._shared_size(1)
 
@@ -74,7 +74,7 @@ class Cameras:
 
     @property
     def camera_from_world(self) -> Float[Tensor, "v 4 4"]:
-        """Inverse poses: a point in world coordinates to camera coordinates."""
+        """Inverse poses, from world to camera coordinates."""
         rotation = self.world_from_camera[:, :3, :3].transpose(1, 2)
         out = torch.eye(4, dtype=rotation.dtype, device=rotation.device).repeat(len(self), 1, 1)
         out[:, :3, :3] = rotation
@@ -82,11 +82,11 @@ class Cameras:
         return out
 
     def resized(self, factor: float) -> "Cameras":
-        """Cameras of images resampled by `factor`; sizes are rounded, intrinsics follow the rounded size exactly."""
+        """Resample all images by `factor`; sizes are rounded, and intrinsics fit the rounded sizes exactly."""
         return self._of_size(self.sizes * factor)
 
     def limited(self, longest_px: int) -> "Cameras":
-        """Cameras of images of which each larger one is resampled to this longest side."""
+        """Resample each larger image to this longest side."""
         longest = self.sizes.max(1, keepdim=True).values
         return self._of_size(self.sizes * (longest_px / longest).clamp_max(1))
 
@@ -97,7 +97,7 @@ class Cameras:
         return replace(self, intrinsics=scale @ self.intrinsics, sizes=sizes)
 
     def turned(self, quarters: Int[Tensor, "v"]) -> "Cameras":
-        """Cameras of images turned counterclockwise by so many quarters each, as torch.rot90 does; same centres."""
+        """Turn each image counterclockwise by its number of quarters, like torch.rot90; centres stay."""
         poses, intrinsics, sizes = self.world_from_camera.clone(), self.intrinsics.clone(), self.sizes.clone()
         once = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]).to(poses)
         for i, count in enumerate(quarters.tolist()):
@@ -110,7 +110,7 @@ class Cameras:
         return replace(self, world_from_camera=poses, intrinsics=intrinsics, sizes=sizes)
 
     def cropped(self, windows: Sequence[Window]) -> "Cameras":
-        """Cameras of images cut to `windows`, one window per camera; names and poses stay."""
+        """Crop each image to its window; names and poses stay."""
         intrinsics = self.intrinsics.clone()
         edges = torch.tensor(windows, dtype=torch.int64).reshape(-1, 4)
         intrinsics[:, :2, 2] -= edges[:, :2].to(intrinsics)
@@ -118,23 +118,23 @@ class Cameras:
         return replace(self, intrinsics=intrinsics, sizes=sizes)
 
     def rays(self) -> Float[Tensor, "h w 3"]:
-        """Directions to the pixel centres of the first camera, in its axes, of depth 1."""
+        """Compute directions to the pixel centres of the first camera, in its axes, scaled to depth 1."""
         v, u = torch.meshgrid(torch.arange(self.height) + 0.5, torch.arange(self.width) + 0.5, indexing="ij")
         return torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(self.intrinsics[0]).T
 
     def spread(self, count: int) -> "Cameras":
-        """At most `count` of the cameras, evenly spaced in their order, the first and the last among them."""
+        """Select at most `count` cameras, evenly spaced in their order, with the first and the last."""
         return self[torch.linspace(0, len(self) - 1, min(count, len(self))).round().long()]
 
     def to(self, device: torch.device | str) -> "Cameras":
-        """The same cameras on `device`; sizes stay on the CPU."""
+        """Move the cameras to `device`; sizes stay on the CPU."""
         return replace(self, world_from_camera=self.world_from_camera.to(device), intrinsics=self.intrinsics.to(device))
 
 
 def pinhole(
     world_from_camera: Float[Tensor, "v 4 4"], focal_px: float, *, width: int, height: int, prefix: str = "view"
 ) -> Cameras:
-    """Cameras that share one focal length, with the principal point at the image centre.
+    """Make cameras with one focal length and the principal point at the image centre.
 
     Args:
         world_from_camera: Rigid poses.
@@ -157,12 +157,12 @@ def pinhole(
 
 
 def look_at(eye: Float[Tensor, "v 3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "v 4 4"]:
-    """Poses of cameras that look at one point.
+    """Compute the poses of cameras that look at one point.
 
     Args:
         eye: Optical centres, world units.
         target: The point at the image centre, world units.
-        up: Direction that points upwards in the image; not parallel to a line of sight.
+        up: Direction that points upwards in the image, not parallel to a line of sight.
 
     Returns:
         The poses `world_from_camera` (OpenCV axes).

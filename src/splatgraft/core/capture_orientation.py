@@ -8,25 +8,24 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 
-_ROUNDS = 10  # rounds of reweighting; this and the others are set by hand
+_ROUNDS = 10  # iterations of reweighting; this and the others are set by hand
 _ROLL_RAD = 0.05  # roll above which a camera counts less: hand-held cameras are level to about three degrees
 _MEAN_UP_WEIGHT = 0.01  # weight of the images' mean up, equal to that of horizontal axes that spread over 6 degrees
-_GOES_ROUND, _LEVEL = 0.35, 0.1
-"""An axis of the images is level, and the cameras go round: least middle eigenvalue of its second moments (a circle has
-a half, an arc of 135 degrees .35), and most that the smallest is of it."""
-_MORE_LEVEL = 0.25  # most that this share is of the other axis's
-_LOOKING_DOWN = 0.05  # mean sine of the angle below the horizon at which cameras look from above at what they go round
-_UP_AFTER, _UP_BEFORE = 0.5, 0.3
-"""Cosine between up and the up of an image that is turned, and of one that is not, as one that looks straight down."""
-_RESIDUAL_FLOOR = 0.1  # distance of an axis from the focus point, over the median one, below which weights stop growing
-_MIN_IN_FRONT = 0.7  # share of the cameras that have the focus point in front of them
+_GOES_ROUND = 0.35  # minimum middle eigenvalue of an axis's second moments: 0.5 for a circle, 0.35 for 135 degrees
+_LEVEL = 0.1  # maximum ratio of the smallest to the middle eigenvalue, the flatness of the axis's directions
+_MORE_LEVEL = 0.25  # maximum flatness relative to the other axis
+_LOOKING_DOWN = 0.05  # minimum mean sine of the view's angle to the horizon; cameras look down, which gives the sign
+_UP_AFTER = 0.5  # minimum cosine between up and the up of a turned image; views straight down stay below
+_UP_BEFORE = 0.3  # maximum cosine between up and the up of an image before it is turned
+_RESIDUAL_FLOOR = 0.1  # distance of an axis from the focus point, over the median, below which weights stop growing
+_MIN_IN_FRONT = 0.7  # minimum share of cameras with the focus point in front of them
 
 
 def estimate_up(cameras: Cameras) -> Float[Tensor, "3"]:
-    """Unit up direction of the world, perpendicular to the images' horizontal axes, as most cameras are not rolled.
+    """Estimate the world's unit up direction, perpendicular to the images' horizontal axes: most cameras are level.
 
-    The images' mean up decides the sign, and the direction where all cameras face one way. Rolled cameras are
-    outliers of an iteratively reweighted least-squares fit.
+    The images' mean up gives the sign, and the direction if all cameras face one way. Rolled cameras are outliers of an
+    iteratively reweighted least-squares fit.
     """
     right, down, _ = cameras.world_from_camera[:, :3, :3].double().unbind(2)
     return _up_of(right, down).to(cameras.world_from_camera)
@@ -44,11 +43,11 @@ def _up_of(right: Float[Tensor, "v 3"], down: Float[Tensor, "v 3"]) -> Float[Ten
 
 
 def quarter_turns(world_from_camera: Float[Tensor, "v 4 4"]) -> Int[Tensor, "v"]:
-    """Counterclockwise quarter turns, 0 to 3, that set each image upright; 0 where that is not clear.
+    """Estimate the counterclockwise quarter turns, 0 to 3, that set each image upright; 0 if that is not clear.
 
-    Where cameras go round something, the images' horizontal axis stays perpendicular to up. Where it is the vertical
-    one that does, all images lie on their side; as cameras look from above, up is known. Single images are turned by
-    the up direction of the others.
+    If cameras go round an object, the images' horizontal axes lie in one plane, perpendicular to up. If the vertical
+    axes lie in one plane instead, all images are on their side; then up is the side from which cameras look down.
+    Single images are turned by the up direction of the others.
     """
     right, down, forward = world_from_camera[:, :3, :3].double().unbind(2)
     moments = [torch.linalg.eigh(axis.T @ axis / max(1, len(axis))) for axis in (right, down)]
@@ -61,17 +60,17 @@ def quarter_turns(world_from_camera: Float[Tensor, "v 4 4"]) -> Int[Tensor, "v"]
         if abs(looking) < _LOOKING_DOWN:
             return torch.zeros(len(right), dtype=torch.long)
         up = -math.copysign(1.0, looking) * up
-    # what is up after each number of turns
+    # cosine between up and the up of each image, by number of turns
     ups = torch.stack([-down, right, down, -right]) @ up
     clear = (ups.amax(0) > _UP_AFTER) & (ups[0] < _UP_BEFORE)
     return torch.where(clear, ups.argmax(0), 0)
 
 
 def focus_point(cameras: Cameras) -> Float[Tensor, "3"]:
-    """The point nearest to all optical axes, in world units, by iteratively reweighted least squares.
+    """Find the point nearest to all optical axes, world units, by iteratively reweighted least squares.
 
     Raises:
-        ValueError: Where it lies behind many cameras, as in a capture that looks outwards.
+        ValueError: It lies behind many cameras, as in a capture that looks outwards.
     """
     centers, forward = cameras.centers.double(), cameras.world_from_camera[:, :3, 2].double()
     weight = torch.ones(len(cameras), dtype=torch.float64)
@@ -86,7 +85,7 @@ def focus_point(cameras: Cameras) -> Float[Tensor, "3"]:
     in_front = float((((point - centers) * forward).sum(-1) > 0).double().mean())
     if in_front < _MIN_IN_FRONT:
         raise ValueError(
-            f"cameras: expected some that look at one place, found one in front of only {in_front:.0%} of them;"
+            f"cameras: expected most of them to look at one place, found a place in front of only {in_front:.0%};"
             " name the place"
         )
     return point.to(cameras.world_from_camera)

@@ -9,11 +9,11 @@ from torch import Tensor
 from splatgraft.core import spherical_harmonics
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-"""Radians; successive points of a Fibonacci lattice or a Vogel spiral are turned by it."""
+"""Azimuth between successive points of a Fibonacci lattice or a Vogel spiral, radians."""
 
 
 def even_directions(count: int) -> Float[Tensor, "n 3"]:
-    """`count` unit vectors spread evenly over the sphere (Fibonacci lattice)."""
+    """Spread `count` unit vectors evenly over the sphere (Fibonacci lattice)."""
     i = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - 2 * i / count
     azimuth = i * GOLDEN_ANGLE
@@ -22,7 +22,7 @@ def even_directions(count: int) -> Float[Tensor, "n 3"]:
 
 
 def even_pairs(count: int) -> Float[Tensor, "n 3"]:
-    """`count` (even) unit vectors over the sphere; entry i + count / 2 is exactly opposite to entry i."""
+    """Spread `count` (even) unit vectors over the sphere; entry i + count / 2 is exactly opposite to entry i."""
     half = even_directions(count)[: count // 2]
     return torch.cat([half, -half])
 
@@ -30,29 +30,29 @@ def even_pairs(count: int) -> Float[Tensor, "n 3"]:
 def vogel_offsets(
     axis: Float[Tensor, "3"], radii: Float[Tensor, "n"], index: Float[Tensor, "n"] | Int[Tensor, "n"]
 ) -> Float[Tensor, "n 3"]:
-    """Offsets perpendicular to unit `axis`, `radii` long, each turned by `index` golden angles (Vogel 1979)."""
+    """Compute offsets perpendicular to unit `axis`, `radii` long, each turned by `index` golden angles (Vogel 1979)."""
     right, down, _ = frames_along(axis[None])[0]
-    # not index * GOLDEN_ANGLE: that rounds otherwise in single precision
+    # not index * GOLDEN_ANGLE: that rounds differently in single precision
     angle = index * math.pi * (3 - math.sqrt(5))
     return (radii * angle.cos())[:, None] * right + (radii * angle.sin())[:, None] * down
 
 
 def perpendicular(axis: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """A unit vector perpendicular to unit `axis`: from the world axis that is least aligned with it."""
+    """Compute a unit vector perpendicular to unit `axis`, from the world axis least aligned with it."""
     world_axis = torch.eye(3, dtype=axis.dtype, device=axis.device)[int(axis.abs().argmin())]
     return torch.nn.functional.normalize(torch.linalg.cross(axis, world_axis), dim=0)
 
 
 def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Tangent and bitangent of unit `normal`: `perpendicular(normal)` and normal x tangent, all three right-handed."""
+    """Compute tangent and bitangent of unit `normal`: `perpendicular(normal)` and normal x tangent, right-handed."""
     tangent = perpendicular(normal)
     return tangent, torch.linalg.cross(normal, tangent)
 
 
 def frames_along(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
-    """Rotations of the lights in unit `directions`; rows right, down, away from the light: x_in_light = R @ x_in_world.
+    """Compute light frames, x_in_light = R @ x_in_world, of unit `directions`; rows right, down, away from the light.
 
-    The depth axis is -direction, so that depth grows away from the light. Not continuous where |z| passes 0.9.
+    The depth axis is -direction, so that depth grows away from the light. The frame jumps where |z| passes 0.9.
     """
     away = -directions
     helper = torch.where(
@@ -65,9 +65,9 @@ def frames_along(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
 def fit_sh(
     directions: Float[Tensor, "n 3"], values: Float[Tensor, "n 3"], weights: Float[Tensor, "n"], *, degree: int = 2
 ) -> Float[Tensor, "k 3"]:
-    """Spherical-harmonic coefficients of `values` at unit `directions`, by weighted least squares.
+    """Fit spherical harmonics to `values` at unit `directions`, by weighted least squares.
 
-    A ridge that grows with l(l+1), a smoothness prior, keeps bands above 0 small where weights are 0: there the
+    A ridge that grows with l(l+1), a smoothness prior, keeps bands above 0 small where weights are 0. There the
     expansion continues its surroundings, then fades to the mean.
     """
     basis = spherical_harmonics.basis(directions, degree).double()

@@ -8,24 +8,24 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-_EDGE_SAMPLES = 129
+_EDGE_SAMPLES = 129  # points on each edge of the image
 
 
 @dataclass(frozen=True)
 class Distortion:
-    """OpenCV's camera with k1, k2, p1, p2, k3 (so COLMAP's SIMPLE_RADIAL, RADIAL and OPENCV)."""
+    """OpenCV's camera with k1, k2, p1, p2, k3; it includes COLMAP's SIMPLE_RADIAL, RADIAL and OPENCV."""
 
     intrinsics: Float64[Tensor, "3 3"]
-    """The distorted camera's matrix, pixels of `size`, pixel centres at +0.5."""
+    """Matrix of the distorted camera, pixels of `size`, pixel centres at +0.5."""
     coefficients: Float64[Tensor, "5"]
-    """k1, k2, p1, p2, k3."""
+    """Coefficients k1, k2, p1, p2, k3."""
     size: tuple[int, int]
-    """Width and height for which `intrinsics` hold, pixels."""
+    """Width and height that `intrinsics` refer to, pixels."""
 
     def pinhole(self) -> Float64[np.ndarray, "3 3"]:
-        """Intrinsics, at `size`, of the pinhole camera with the largest view that has no empty border.
+        """Compute the intrinsics, at `size`, of the pinhole camera with the largest view without empty border.
 
-        Raises: ValueError where the distortion folds the image over itself.
+        Raises: ValueError if the distortion folds the image over itself.
         """
         width, height = self.size
         t = np.linspace(0, 1, _EDGE_SAMPLES)
@@ -56,7 +56,7 @@ class Distortion:
     def undistort(
         self, image: Float[Tensor, "h w *c"], pinhole: Float[Tensor, "3 3"], *, width: int, height: int
     ) -> Float[Tensor, "h w *c"]:
-        """`image`, at its own resolution, as a pinhole camera of `width` x `height` pixels sees it."""
+        """Resample `image`, at its own resolution, to the view of a pinhole camera of `width` x `height` pixels."""
         h, w = image.shape[:2]
         half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV has pixel centres at whole numbers
         to_file = np.diag([w / self.size[0], h / self.size[1], 1])
@@ -75,7 +75,7 @@ class Distortion:
         return torch.from_numpy(moved).reshape(image.shape)
 
     def undistort_points(self, points: Float[Tensor, "k 2"], pinhole: Float[Tensor, "3 3"]) -> Float[Tensor, "k 2"]:
-        """Where a pinhole camera sees what the distorted picture, of `size`, shows at `points` (x, y), pixels."""
+        """Map `points` (x, y) of the distorted picture, pixels of `size`, to pixels of a pinhole camera."""
         if not len(points):
             return points
         found = cv2.undistortPoints(

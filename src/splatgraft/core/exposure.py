@@ -1,7 +1,7 @@
-"""Camera settings of photographs, and the luminance that linear pixel values stand for under them.
+"""Camera settings of photographs, and the absolute luminance of linear pixel values that follows from them.
 
-Exposure values are at ISO 100: EV = log2(N^2 / t) - log2(ISO / 100). A pixel saturates at 1.2 * 2^EV cd/m2, from a
-saturation-based speed of 78 / H (ISO 12232) and a lens that passes 0.65 of the light.
+Exposure values are at ISO 100: EV = log2(N^2 / t) - log2(ISO / 100). A pixel saturates at 1.2 * 2^EV cd/m2, for a
+saturation-based speed of 78 / H (ISO 12232) and a lens that transmits 0.65 of the light.
 """
 
 import math
@@ -13,13 +13,13 @@ _SATURATION_CD_M2 = 78 / (100 * 0.65)  # luminance of white at EV 0 and ISO 100
 _EV_OF_BRIGHTNESS_0 = 5.0  # APEX: the speed value of ISO 100
 _GAMMA = 2.2
 MAX_STOPS = 0.4
-"""Between the darkest and the brightest setting of a capture's photos, above which settings count as different: a third
-of a stop, one step of a camera's dial, which with the rounded numbers on it is up to 0.36 (1/160 s and 1/125 s)."""
+"""Largest range of exposures, stops, in a capture whose settings count as equal: one step of a camera's dial. This is a
+third of a stop, up to 0.36 by the rounded numbers on the dial (1/160 s and 1/125 s)."""
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """Settings of one photograph as its file tells them, each None where it does not."""
+    """Settings of one photograph; unknown ones are None."""
 
     shutter_s: float | None = None
     """Exposure time, seconds, above 0."""
@@ -36,9 +36,9 @@ class Exposure:
 
     @property
     def ev100(self) -> float | None:
-        """Exposure value at ISO 100, stops: one more means that white is twice the luminance.
+        """Exposure value at ISO 100, stops; one more doubles the luminance of white.
 
-        From shutter, aperture and ISO; where one is missing, from the metered brightness and the compensation.
+        Computed by shutter, aperture and ISO, or else by metered brightness and compensation.
         """
         if self.shutter_s is not None and self.aperture is not None and self.iso is not None:
             return math.log2(self.aperture**2 / self.shutter_s) - math.log2(self.iso / 100)
@@ -47,7 +47,7 @@ class Exposure:
         return None
 
     def __str__(self) -> str:
-        """The settings as photographers write them, such as '1/60 s f/1.8 ISO 100'."""
+        """Write the settings in photographers' notation, such as '1/60 s f/1.8 ISO 100'."""
         if self.shutter_s is None or self.aperture is None or self.iso is None:
             return "unknown settings" if self.ev100 is None else f"EV {self.ev100:.1f}"
         short = self.shutter_s < 0.4
@@ -56,7 +56,7 @@ class Exposure:
 
 
 def relative_gains(exposures: Sequence[Exposure]) -> list[float]:
-    """How much brighter each photo's sRGB values are than the mean photo's, by its settings; 1 where they are unknown.
+    """Compute the brightness of each photo's sRGB values over the mean photo's, by its settings; 1 if unknown.
 
     A factor on linear light is its 2.2th root in sRGB, before a camera's tone curve.
     """
@@ -68,18 +68,18 @@ def relative_gains(exposures: Sequence[Exposure]) -> list[float]:
 
 @dataclass(frozen=True)
 class LuminanceScale:
-    """Absolute luminance of a capture's linear values, cd/m2; right to about a stop, as cameras' speeds differ."""
+    """Luminance of a capture's linear values, cd/m2; accurate to about a stop, because cameras' speeds differ."""
 
     white: float
-    """Luminance that the linear value 1 stands for in the median photo."""
+    """Luminance of the linear value 1 in the median photo."""
     mean: float
-    """Mean luminance of what the photos show, the median over photos."""
+    """Mean luminance of a photo's content, median over photos."""
 
 
 def luminance_scale(exposures: Sequence[Exposure], means: Sequence[float]) -> LuminanceScale | None:
-    """The luminance behind a capture's linear values; None where under half of the photos have exposure data.
+    """Compute the luminance scale of a capture; None if fewer than half of the photos have exposure data.
 
-    `means`: mean linear luminance of each photo's pixels, in [0, 1].
+    `means` are mean linear luminances of the photos' pixels, in [0, 1].
     """
     whites = [None if one.ev100 is None else _SATURATION_CD_M2 * 2**one.ev100 for one in exposures]
     known = [(white, mean) for white, mean in zip(whites, means, strict=True) if white is not None]
@@ -89,7 +89,7 @@ def luminance_scale(exposures: Sequence[Exposure], means: Sequence[float]) -> Lu
 
 
 def describe_inconsistency(exposures: Sequence[Exposure]) -> str | None:
-    """What differs between the settings of photos and what that leads to, in one line; None where nothing does."""
+    """Describe differing settings of photos and their effect, in one line; None if none differ."""
     known = sorted((value, str(one)) for one in exposures if (value := one.ev100) is not None)
     stops = known[-1][0] - known[0][0] if known else 0.0
     found: list[str] = []

@@ -1,4 +1,4 @@
-"""LDR-FLIP (Andersson et al. 2020): the difference that an observer sees when two images alternate on a screen.
+"""LDR-FLIP (Andersson et al. 2020): the visible difference of two images that alternate on a screen.
 
 Colours are compared after the blur of the eye's contrast sensitivity, edges and points before it. Equation and section
 numbers are those of the paper. The authors' package flip-evaluator gives the same values (a test compares them) but has
@@ -24,7 +24,7 @@ _KNEE = (0.4, 0.95)  # p_c and p_t: differences up to p_c of the largest are spr
 _FEATURE_WIDTH_DEGREES = 0.082  # w, from peak to trough of the edge detector (Sec. 4.2.1).
 _FEATURE_EXPONENT = 0.5  # q_f (Sec. 4.2.2).
 VERSION = "LDR-FLIP 2020, own implementation, 67.02 pixels per degree"
-"""What a figure of FLIP was computed with."""
+"""Implementation and viewing conditions, recorded beside each value."""
 
 _XYZ_FROM_LINEAR = torch.tensor(
     [
@@ -37,12 +37,12 @@ _XYZ_FROM_LINEAR = torch.tensor(
 """sRGB primaries with the white point D65, as the publication's reference has them."""
 _WHITE = _XYZ_FROM_LINEAR.sum(1)
 _OPPONENT = torch.tensor([[0.0, 116, 0], [500, -500, 0], [0, 200, -200]], dtype=torch.float64)
-"""Differences of XYZ over white to Y Cx Cz, and of their cube roots to L* a* b*; the first has an offset of -16."""
-_OFFSET = torch.tensor([-16.0, 0, 0], dtype=torch.float64)
+"""Matrix from XYZ over white to Y Cx Cz, and from their cube roots to L* a* b*."""
+_OFFSET = torch.tensor([-16.0, 0, 0], dtype=torch.float64)  # added to the three
 
 
 def flip_map(image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-    """The visible difference of each pixel of two sRGB images in [0, 1]: in [0, 1], symmetric in the two."""
+    """Compute the visible difference of each pixel of two sRGB images; in [0, 1], symmetric in the two."""
     both = [_opponent(linear_from_srgb(x.double().clamp(0, 1))) for x in (image, reference)]
     seen = [_hunt(_lab(_as_seen(x))) for x in both]
     color = _spread(_hyab(seen[0], seen[1]) ** _COLOR_EXPONENT)
@@ -55,18 +55,18 @@ def flip_map(image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"]) -
 def flip(
     image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"], region: Bool[Tensor, "h w"] | None = None
 ) -> Float[Tensor, ""]:
-    """Mean of the visible difference of all pixels, or of those of a region; nan where that is empty."""
+    """Average the visible difference over all pixels, or over a region; nan if that is empty."""
     errors = flip_map(image, reference)
     return errors.mean() if region is None else errors[region].mean()
 
 
 def _opponent(linear: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Y Cx Cz, a linear space in which the eye's sensitivity is known by channel."""
+    """Convert to Y Cx Cz, a linear space whose channels have known contrast sensitivities."""
     return (linear @ _XYZ_FROM_LINEAR.T.to(linear) / _WHITE.to(linear)) @ _OPPONENT.T.to(linear) + _OFFSET.to(linear)
 
 
 def _as_seen(opponent: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Linear RGB after the blur of the eye, clamped to what the screen can show."""
+    """Blur Y Cx Cz by the eye's contrast sensitivity; returns linear RGB, clamped to the screen's range."""
     blurred = torch.stack([_blur(opponent[..., i], channel) for i, channel in enumerate(_SENSITIVITY)], -1)
     inverse = torch.linalg.inv(_OPPONENT).to(blurred)
     xyz = (blurred - _OFFSET.to(blurred)) @ inverse.T * _WHITE.to(blurred)
@@ -74,7 +74,7 @@ def _as_seen(opponent: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
 
 
 def _blur(values: Float[Tensor, "h w"], gaussians: tuple[tuple[float, float], ...]) -> Float[Tensor, "h w"]:
-    """Blur by a sum of Gaussians, which is one of products of rows and columns."""
+    """Blur by a sum of Gaussians, each applied along rows and columns."""
     widest = max(b for channel in _SENSITIVITY for _, b in channel)
     radius = math.ceil(3 * math.sqrt(widest / (2 * math.pi**2)) * _PIXELS_PER_DEGREE)
     x = torch.arange(-radius, radius + 1, dtype=values.dtype, device=values.device) / _PIXELS_PER_DEGREE
@@ -86,14 +86,14 @@ def _blur(values: Float[Tensor, "h w"], gaussians: tuple[tuple[float, float], ..
 def _separable(
     values: Float[Tensor, "h w"], across: Float[Tensor, " k"], down: Float[Tensor, " k"]
 ) -> Float[Tensor, "h w"]:
-    """Correlate with a kernel that is a product of a row and a column; the border's pixels go on outside."""
+    """Correlate with the product of a row and a column; border pixels are repeated outside."""
     radius = len(across) // 2
     padded = F.pad(values[None, None], (radius, radius, radius, radius), mode="replicate")
     return F.conv2d(F.conv2d(padded, across[None, None, None]), down[None, None, :, None])[0, 0]
 
 
 def _lab(linear: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """CIE L* a* b*."""
+    """Convert to CIE L* a* b*."""
     ratio = linear @ _XYZ_FROM_LINEAR.T.to(linear) / _WHITE.to(linear)
     knee = 6 / 29
     root = torch.where(ratio > knee**3, ratio.clamp_min(knee**3) ** (1 / 3), ratio / (3 * knee**2) + 4 / 29)
@@ -101,17 +101,17 @@ def _lab(linear: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
 
 
 def _hunt(lab: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Colours count less where it is dark (Hunt effect)."""
+    """Scale chroma by lightness: colours differ less in the dark (Hunt effect)."""
     return torch.cat([lab[..., :1], 0.01 * lab[..., :1] * lab[..., 1:]], -1)
 
 
 def _hyab(a: Float[Tensor, "*n 3"], b: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-    """Distance of colours far apart: city block in lightness, Euclidean in chroma (Abasi et al. 2020)."""
+    """Compute the HyAB distance: city block in lightness, Euclidean in chroma (Abasi et al. 2020)."""
     return (a - b)[..., 0].abs() + (a - b)[..., 1:].norm(dim=-1)
 
 
 def _spread(powered: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Colour differences mapped to [0, 1]; the largest is between green and blue."""
+    """Map colour differences to [0, 1]; the largest is between green and blue."""
     primaries = _hunt(_lab(torch.eye(3, dtype=powered.dtype, device=powered.device)[None, 1:]))[0]
     largest = float(_hyab(primaries[0], primaries[1])) ** _COLOR_EXPONENT
     part, top = _KNEE
@@ -121,7 +121,7 @@ def _spread(powered: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 
 
 def _features(luminance: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Strength of edges and of points, by first and second derivatives of a Gaussian."""
+    """Compute the strength of edges and of points, by first and second derivatives of a Gaussian."""
     deviation = 0.5 * _FEATURE_WIDTH_DEGREES * _PIXELS_PER_DEGREE
     radius = math.ceil(3 * deviation)
     x = torch.arange(-radius, radius + 1, dtype=luminance.dtype, device=luminance.device)

@@ -18,13 +18,13 @@ class Gaussians:
     means: Float[Tensor, "n 3"]
     """Centres, world units."""
     log_scales: Float[Tensor, "n 3"]
-    """Natural logarithm of the standard deviations along the own axes, world units."""
+    """Natural logarithms of the standard deviations along the own axes, world units."""
     quaternions: Float[Tensor, "n 4"]
-    """Own axes in the world, wxyz, of any length but zero."""
+    """Rotations from own to world axes, wxyz, of any length above zero."""
     opacity_logits: Float[Tensor, "n"]
-    """Opacity before the sigmoid."""
+    """Opacities before the sigmoid."""
     sh: Float[Tensor, "n k 3"]
-    """Spherical-harmonic colour, k = (degree + 1)^2, sRGB minus one half."""
+    """Spherical-harmonic coefficients of sRGB minus one half, k = (degree + 1)^2."""
 
     @property
     def count(self) -> int:
@@ -48,46 +48,46 @@ class Gaussians:
 
     @property
     def opacities(self) -> Float[Tensor, "n"]:
-        """Opacity in (0, 1)."""
+        """Opacities in (0, 1)."""
         return self.opacity_logits.sigmoid()
 
     @property
     def rotations(self) -> Float[Tensor, "n 3 3"]:
-        """Own axes as columns, in the world."""
+        """Rotations from own to world axes; columns are the own axes."""
         return rotation_from_quaternion(self.quaternions)
 
     @property
     def covariances(self) -> Float[Tensor, "n 3 3"]:
-        """World-space covariance R S S^T R^T (3DGS, Eq. 6)."""
+        """World-space covariances R S S^T R^T (3DGS, Eq. 6)."""
         half = self.rotations * self.scales[:, None, :]
         return half @ half.transpose(1, 2)
 
     def select(self, which: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> "Gaussians":
-        """The Gaussians where the mask is true, or those at the given indices, in their order."""
+        """Select the Gaussians where the mask is true, or those at the given indices, in their order."""
         return self.map(lambda tensor: tensor[which])
 
     def map(self, function: Callable[[Tensor], Tensor]) -> "Gaussians":
-        """A copy with `function` applied to every tensor."""
+        """Apply `function` to every tensor."""
         return replace(self, **{field.name: function(getattr(self, field.name)) for field in fields(self)})
 
     def to(self, device: torch.device | str) -> "Gaussians":
-        """The same Gaussians on `device`."""
+        """Move the Gaussians to `device`."""
         return self.map(lambda tensor: tensor.to(device))
 
     def with_sh_degree(self, degree: int) -> "Gaussians":
-        """Higher bands cut off, or padded with zeros."""
+        """Cut off higher bands, or pad with zeros."""
         return replace(self, sh=spherical_harmonics.with_degree(self.sh, degree))
 
 
 def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-    """All Gaussians of `parts` in order; bands are padded to the highest degree among them."""
+    """Concatenate `parts` in order; bands are padded to the highest degree among them."""
     degree = max(part.sh_degree for part in parts)
     padded = [part.with_sh_degree(degree) for part in parts]
     return Gaussians(**{f.name: torch.cat([getattr(part, f.name) for part in padded]) for f in fields(Gaussians)})
 
 
 def empty(sh_degree: int = 0) -> Gaussians:
-    """A scene of zero Gaussians."""
+    """Make a scene of zero Gaussians."""
     return Gaussians(
         means=torch.zeros(0, 3),
         log_scales=torch.zeros(0, 3),

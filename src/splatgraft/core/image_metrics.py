@@ -1,4 +1,4 @@
-"""PSNR and SSIM (Wang 2004) of images in [0, 1], whole or inside a region, differentiable; a fit of colours."""
+"""PSNR and SSIM (Wang 2004) of images in [0, 1], whole or in a region, differentiable; and a fit of colours."""
 
 import torch
 import torch.nn.functional as F
@@ -9,17 +9,17 @@ from torch import Tensor
 def psnr(
     image: Float[Tensor, "*n c"], reference: Float[Tensor, "*n c"], region: Bool[Tensor, "*n"] | None = None
 ) -> Float[Tensor, ""]:
-    """Peak signal-to-noise ratio in dB for a peak of 1; infinite where equal, nan where the region is empty."""
+    """Compute the peak signal-to-noise ratio, dB, for a peak of 1: infinite for equal images, nan for no pixels."""
     squares = (image - reference) ** 2
     mean = squares.mean() if region is None else squares[region].mean()
     return -10 * mean.log10()
 
 
 def fit_color(image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """`image` with its colours mapped to the reference's by one affine map (least squares), clamped to [0, 1].
+    """Map the colours of `image` to the reference's by one affine map (least squares), clamped to [0, 1].
 
-    What is left of the error has no exposure and white balance in it (as `color_correct` of Mip-NeRF 360's evaluation,
-    without its quadratic terms).
+    The remaining error is free of exposure and white balance. `color_correct` of Mip-NeRF 360's evaluation has
+    quadratic terms besides.
     """
     pixels = image.reshape(-1, 3).double()
     columns = torch.cat([pixels, torch.ones_like(pixels[:, :1])], 1)
@@ -36,9 +36,9 @@ def _window(channels: int, like: Tensor) -> Float[Tensor, "c 1 11 1"]:
 
 
 def ssim_map(image: Float[Tensor, "h w c"], reference: Float[Tensor, "h w c"]) -> Float[Tensor, "i j c"]:
-    """Structural similarity per pixel (Wang 2004): 11x11 Gaussian window of sigma 1.5, valid pixels only (h-10, w-10).
+    """Compute SSIM per pixel (Wang 2004): 11x11 Gaussian window of sigma 1.5, (h-10, w-10) valid pixels.
 
-    Raises: ValueError where an image is smaller than the window.
+    Raises: ValueError if an image is smaller than the window.
     """
     h, w, channels = image.shape
     if min(h, w) < 11:
@@ -58,6 +58,6 @@ def ssim_map(image: Float[Tensor, "h w c"], reference: Float[Tensor, "h w c"]) -
 def ssim(
     image: Float[Tensor, "h w c"], reference: Float[Tensor, "h w c"], region: Bool[Tensor, "h w"] | None = None
 ) -> Float[Tensor, ""]:
-    """Mean structural similarity; over a region, the mean of the pixels whose window centre lies in it."""
+    """Average structural similarity, over a region by the pixels whose window centre lies in it."""
     values = ssim_map(image, reference)
     return values.mean() if region is None else values[region[5:-5, 5:-5]].mean()

@@ -1,6 +1,6 @@
 """Images as tensors: reading and writing files, the sRGB transfer function, resampling.
 
-Every reader raises ValueError where the file is no readable image.
+Every reader raises ValueError if the file is no readable image.
 """
 
 import math
@@ -27,33 +27,33 @@ IMAGE_SUFFIXES = WRITTEN_SUFFIXES | _HEIF_SUFFIXES
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP")
 _TURNED_SIDEWAYS = (5, 6, 7, 8)  # EXIF orientations that exchange width and height
 _FROM_RIGHT, _FROM_BELOW = (2, 3, 7, 8), (3, 4, 6, 7)
-"""EXIF orientations of which stored columns and rows are counted from the other side than when shown upright."""
-_ALWAYS_ALLOWED_PIXELS = 1 << 24
+"""EXIF orientations whose stored columns, or rows, run opposite to those of the upright image."""
+_ALWAYS_ALLOWED_PIXELS = 1 << 24  # pixels that a file of any length may have
 _PIXELS_PER_BYTE = 1 << 14
-"""Above every real image: a black 1-bit PNG has 8256. Above 179 million pixels Pillow itself refuses."""
+"""Bound above every real image: a black 1-bit PNG has 8256. Pillow itself refuses more than 179 million pixels."""
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
-"""Weights of linear rgb in luminance (Rec. 709)."""
-_MEAN_PX = 256  # longest side from which a mean is taken of a file that can be read smaller than it is
+"""Luminance weights of linear RGB (Rec. 709)."""
+_MEAN_PX = 256  # minimum size at which a JPEG is decoded for its mean
 _GREY_SCALES = {"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I;16N": 65535, "I": 65535, "F": 1}
-"""White in Pillow's modes of more than 8 bits; some versions read a 16-bit PNG as mode I."""
+"""White level of Pillow's modes of more than 8 bits; some versions read a 16-bit PNG as mode I."""
 
 
 def linear_from_srgb(srgb: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Linear light of display-referred values (IEC 61966-2-1); negative values are kept by odd symmetry."""
+    """Decode sRGB to linear light (IEC 61966-2-1); negative values by odd symmetry."""
     magnitude = srgb.abs()
     linear = torch.where(magnitude <= 0.04045, magnitude / 12.92, ((magnitude + 0.055) / 1.055) ** 2.4)
     return linear * srgb.sign()
 
 
 def srgb_from_linear(linear: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Display-referred values of linear light; the inverse of `linear_from_srgb`."""
+    """Encode linear light as sRGB; the inverse of `linear_from_srgb`."""
     magnitude = linear.abs()
     powered = 1.055 * magnitude.clamp_min(1e-8) ** (1 / 2.4) - 0.055
     return torch.where(magnitude <= 0.0031308, magnitude * 12.92, powered) * linear.sign()
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files directly in `folder`, sorted by name."""
+    """List the image files directly in `folder`, sorted by name."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
 
 
@@ -73,7 +73,7 @@ def read_rgb(path: Path | str) -> Float[Tensor, "h w 3"]:
 
 
 def read_straight_rgb(path: Path) -> Float[Tensor, "h w 3"]:
-    """sRGB in [0, 1] as stored, transparency left aside; at soft edges the full colour (straight alpha)."""
+    """Read sRGB in [0, 1] as stored, without alpha; soft edges have their full colour (straight alpha)."""
     image = _open(path)
     if not image.has_transparency_data:
         return _rgb(image)
@@ -83,10 +83,10 @@ def read_straight_rgb(path: Path) -> Float[Tensor, "h w 3"]:
 def read_stored_rgb(
     path: Path, size: tuple[int, int] | None = None, *, longest_px: int | None = None
 ) -> Float[Tensor, "h w 3"]:
-    """sRGB in [0, 1] on the stored pixel grid, to which poses refer: COLMAP ignores EXIF rotation.
+    """Read sRGB in [0, 1] on the stored pixel grid; poses refer to it, because COLMAP ignores EXIF rotation.
 
-    A file whose upright grid alone has the shape of the camera's image, `size`, is turned: other programs heed EXIF
-    rotation. A picture longer than `longest_px` is reduced to it; a JPEG is then decoded at less than its full size.
+    Other programs apply EXIF rotation: the image is turned if that alone gives it the shape of the camera's `size`. A
+    picture longer than `longest_px` is reduced to it; a JPEG is then decoded at a reduced size.
     """
     with opened(path) as image:
         if longest_px is not None:
@@ -99,7 +99,7 @@ def read_stored_rgb(
 
 
 def stored_size(path: Path, size: tuple[int, int] | None = None) -> tuple[int, int]:
-    """Width and height of the grid that `read_stored_rgb` reads at full size, without decoding it."""
+    """Return width and height of the grid that `read_stored_rgb` reads at full size, without decoding."""
     with opened(path) as image:
         width, height = image.size
         return (height, width) if size is not None and _is_sideways(image, size) else (width, height)
@@ -108,7 +108,7 @@ def stored_size(path: Path, size: tuple[int, int] | None = None) -> tuple[int, i
 def stored_points(
     path: Path, points: Float[Tensor, "n 2"], size: tuple[int, int] | None = None
 ) -> Float[Tensor, "n 2"]:
-    """Points of a picture as a viewer shows it, pixels, on the grid that `read_stored_rgb` reads for `size`."""
+    """Map points of the upright picture, pixels, to the grid that `read_stored_rgb` reads for `size`."""
     with opened(path) as image:
         orientation = 1 if size is not None and _is_sideways(image, size) else _exif_orientation(image)
         width, height = image.size
@@ -121,20 +121,20 @@ def stored_points(
 
 
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes are those of one image scaled, with sides rounded to whole pixels."""
+    """Whether two sizes have the same aspect ratio, with sides rounded to whole pixels."""
     # with both sides scaled by one factor and rounded, the cross products differ by at most one longer side
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
 
 
 def _is_sideways(image: Image.Image, size: tuple[int, int]) -> bool:
-    """Whether EXIF rotation, and it alone, gives the image the shape of `size`."""
+    """Whether the image has the shape of `size` only after EXIF rotation."""
     if same_shape(image.size, size) or not same_shape((image.height, image.width), size):
         return False
     return _exif_orientation(image) in _TURNED_SIDEWAYS
 
 
 def _exif_orientation(image: Image.Image) -> int:
-    """1 to 8; 1, upright, where there is none."""
+    """Return the EXIF orientation, 1 to 8; 1, upright, if there is none."""
     try:
         return image.getexif().get(Base.Orientation, 1)
     except Exception:  # as in read_exif
@@ -142,7 +142,7 @@ def _exif_orientation(image: Image.Image) -> int:
 
 
 def shrink_on_decoding(image: Image.Image, longest_px: int) -> None:
-    """Let a JPEG that is not decoded yet be decoded at a half, quarter or eighth, at least twice `longest_px` long.
+    """Make a JPEG decode at a half, quarter or eighth of its size, at least twice `longest_px` long.
 
     The factor of two leaves the final reduction to a better filter.
     """
@@ -152,7 +152,7 @@ def shrink_on_decoding(image: Image.Image, longest_px: int) -> None:
 
 
 def mean_luminance(path: Path) -> float:
-    """Mean linear luminance (Rec. 709) of a picture in [0, 1]; a JPEG is read at a small size."""
+    """Compute the mean linear luminance (Rec. 709) of a picture, in [0, 1]; a JPEG is decoded at a small size."""
     with opened(path) as image:
         image.draft(None, (_MEAN_PX, _MEAN_PX))
         image.load()
@@ -161,7 +161,7 @@ def mean_luminance(path: Path) -> float:
 
 
 def read_grey(path: Path, longest_px: int) -> UInt8[np.ndarray, "h w"]:
-    """Luma of a picture as a viewer shows it, at most `longest_px` long; a JPEG is decoded at a small size."""
+    """Read the luma of the upright picture, at most `longest_px` long; a JPEG is decoded at a small size."""
     with opened(path) as image:
         image.draft(None, (longest_px, longest_px))
         image.load()
@@ -171,7 +171,7 @@ def read_grey(path: Path, longest_px: int) -> UInt8[np.ndarray, "h w"]:
 
 
 def read_upright(path: Path, longest_px: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
-    """A picture as a viewer shows it, at most `longest_px` long, and its full width and height upright."""
+    """Read the upright picture, at most `longest_px` long, and return its full width and height as well."""
     with opened(path) as image:
         width, height = image.size
         size = (height, width) if _exif_orientation(image) in _TURNED_SIDEWAYS else (width, height)
@@ -185,11 +185,11 @@ def read_upright(path: Path, longest_px: int) -> tuple[UInt8[np.ndarray, "h w 3"
 
 
 def read_exif(path: Path) -> dict[int, Any]:
-    """The camera's EXIF tags of an image file, with Pillow's values; empty where there are none or they are damaged."""
+    """Read the camera's EXIF tags, with Pillow's values; empty if there are none or they are damaged."""
     with opened(path) as image:
         try:
             return dict(image.getexif().get_ifd(IFD.Exif))
-        except Exception:  # Pillow's parsers raise more kinds than it documents; damaged metadata tells nothing
+        except Exception:  # Pillow's parsers raise more kinds than it documents; damaged metadata counts as none
             return {}
 
 
@@ -200,7 +200,7 @@ def has_transparency(path: Path) -> bool:
 
 
 def read_alpha(path: Path, size: tuple[int, int] | None = None) -> Float[Tensor, "h w"]:
-    """The alpha channel in [0, 1] on the pixel grid of `read_stored_rgb`; ones where the file has none."""
+    """Read the alpha channel in [0, 1] on the pixel grid of `read_stored_rgb`; ones if the file has none."""
     image = _open(path)
     if size is not None and _is_sideways(image, size):
         image = ImageOps.exif_transpose(image)
@@ -210,7 +210,7 @@ def read_alpha(path: Path, size: tuple[int, int] | None = None) -> Float[Tensor,
 
 
 def read_mask(path: Path) -> Float[Tensor, "h w"]:
-    """Coverage in [0, 1] on the stored pixel grid: the alpha channel where the file has one that varies, else luma."""
+    """Read coverage in [0, 1] on the stored pixel grid: the alpha channel if it varies, else luma."""
     image = _open(path)
     if image.has_transparency_data:
         alpha = np.array(image.convert("RGBA").getchannel("A"))
@@ -231,7 +231,7 @@ def _rgb(image: Image.Image) -> Float[Tensor, "h w 3"]:
 
 
 def _grey(image: Image.Image) -> Float[Tensor, "h w"]:
-    """Modes that Pillow clips to 8 bits where it should scale."""
+    """Scale a mode of more than 8 bits, which Pillow would clip."""
     values = np.array(image).astype(np.float32) / _GREY_SCALES[image.mode]
     return torch.from_numpy(np.nan_to_num(values)).clamp(0, 1)
 
@@ -244,7 +244,7 @@ def _open(path: Path) -> Image.Image:
 
 @contextmanager
 def opened(path: Path) -> Iterator[Image.Image]:
-    """The opened image, not decoded yet; all of Pillow's errors about a broken file become one ValueError."""
+    """Open an image without decoding it; every error of Pillow's about a broken file becomes a ValueError."""
     if not path.is_file():
         raise ValueError(f"{path}: expected an image file, found none")
     formats = (*_FORMATS, "HEIF") if _with_heif(path) else _FORMATS
@@ -260,7 +260,7 @@ def opened(path: Path) -> Iterator[Image.Image]:
 
 
 def _with_heif(path: Path) -> bool:
-    """Whether the file is HEIF by its suffix; Pillow's plugin is then loaded."""
+    """Load Pillow's HEIF plugin if the suffix asks for it; returns whether it does."""
     if path.suffix.lower() not in _HEIF_SUFFIXES:
         return False
     if find_spec("pillow_heif") is None:
@@ -272,7 +272,7 @@ def _with_heif(path: Path) -> bool:
 
 
 _WRITE_OPTIONS = {"JPEG": {"quality": 95}, "PNG": {"compress_level": 1}}
-"""By Pillow's name of the format; at its own level 6 a PNG takes four times as long and a tenth less space."""
+"""Options by Pillow's name of the format; level 6, its own, takes a PNG four times as long for a tenth less space."""
 
 
 def write_image(path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"]) -> None:
@@ -308,7 +308,7 @@ def write_radiance(path: Path, radiance: Float[Tensor, "h w 3"]) -> None:
 
 
 def resize(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "j i *c"]:
-    """Resampled by area where it shrinks, bilinearly where it grows."""
+    """Resample by area if a side shrinks, else bilinearly."""
     if (image.shape[1], image.shape[0]) == (width, height):
         return image
     shrinks = width < image.shape[1] or height < image.shape[0]

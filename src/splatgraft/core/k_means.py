@@ -1,4 +1,4 @@
-"""k-means on feature vectors, with means that the caller starts from; the same result on every run."""
+"""k-means on feature vectors, from given initial means; the result is the same on every run."""
 
 import torch
 from jaxtyping import Float
@@ -6,9 +6,9 @@ from torch import Tensor
 
 
 def k_means(features: Float[Tensor, "n f"], means: Float[Tensor, "k f"], *, rounds: int) -> Float[Tensor, "k f"]:
-    """Move `means` to the middles of the features nearest to them, `rounds` times (Lloyd 1982).
+    """Move `means` to the centroids of their nearest features, `rounds` times (Lloyd 1982).
 
-    A mean that is nearest to no feature stays where it was.
+    A mean that is nearest to no feature stays.
     """
     for _ in range(rounds):
         label = torch.cdist(features, means).argmin(1)

@@ -18,50 +18,50 @@ _MIN_POINTS = 50  # fewer points give no plane
 
 @dataclass(frozen=True)
 class LevelPlaneOptions:
-    """What counts as a clear level plane; values set by hand."""
+    """Criteria of a clear level plane, set by hand."""
 
     tilt_deg: float = 25.0
     """Largest angle between the plane's normal and the given up."""
     inlier_share: float = 0.2
-    """Least share of all points that lie on the plane."""
+    """Minimum share of all points that lie on the plane."""
     thickness: float = 0.01
     """Largest distance of an inlier, over the median distance of the points from their median."""
 
 
 @dataclass(frozen=True)
 class LevelPlane:
-    """All x with normal . x = offset."""
+    """Points x with normal . x = offset."""
 
     normal: Float[Tensor, "3"]
-    """Unit, upwards."""
+    """Unit normal that points upwards."""
     offset: float
-    """Along the normal from the world's origin, world units."""
+    """Distance from the world's origin along the normal, world units."""
     thickness: float
-    """Largest distance of a point that counts as on it, world units."""
+    """Largest distance of an inlier, world units."""
 
     def height(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
-        """Signed distance above it, world units."""
+        """Compute the signed distance above the plane, world units."""
         return points @ self.normal.to(points) - self.offset
 
 
 def sample_planes(
     points: Float[Tensor, "m 3"], trials: int, *, seed: int
 ) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t 3"]]:
-    """`trials` planes through three random points each: normals, of twice the triangle's area, and a point on each."""
+    """Sample planes through three random points; returns normals, of twice the triangle's area, and a point on each."""
     generator = torch.Generator().manual_seed(seed)
     corners = points[torch.randint(len(points), (trials, 3), generator=generator)]
     return torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners[:, 0]
 
 
 def least_squares_normal(offsets: Float[Tensor, "m 3"]) -> Float[Tensor, "3"]:
-    """Unit normal, of either sign and in float64, of the plane through the origin nearest to `offsets`."""
+    """Fit a plane through the origin to `offsets`; returns its unit normal, of either sign, in float64."""
     return torch.linalg.eigh(offsets.double().T @ offsets.double()).eigenvectors[:, 0]
 
 
 def dominant_level_plane(
     points: Float[Tensor, "m 3"], up: Float[Tensor, "3"], *, options: LevelPlaneOptions = LevelPlaneOptions()
 ) -> LevelPlane | None:
-    """The largest nearly level plane among sparse surface points; None where no plane is level and large enough."""
+    """Find the largest nearly level plane among sparse surface points; None if no plane is level and large enough."""
     x, upward = points.double(), up.double()
     if len(x) < _MIN_POINTS:
         return None

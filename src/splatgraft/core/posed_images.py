@@ -14,17 +14,17 @@ from splatgraft.core.images import read_alpha, read_mask, read_stored_rgb, resiz
 
 @dataclass(frozen=True)
 class LeftOut:
-    """An image of a capture that is not used, or its mask."""
+    """An unused image of a capture, or the unused mask of one."""
 
     name: str
-    """The image, as the capture names it."""
+    """Name of the image in the capture."""
     reason: str
-    """What was expected and what was found, in one line."""
+    """Reason in one line: what was expected and what was found."""
     mask_only: bool = False
-    """Whether the image itself is used."""
+    """Whether only the mask is left out."""
 
     def __str__(self) -> str:
-        """For people."""
+        """Name the image or the mask for a message."""
         return f"the mask of {self.name}" if self.mask_only else self.name
 
 
@@ -33,37 +33,37 @@ class PosedImages:
     """v images with their cameras, and m sparse points from structure from motion."""
 
     image_paths: tuple[Path, ...]
-    """One file per camera, in the cameras' order, as photographed; `image` undistorts them."""
+    """Image files in the cameras' order, as photographed; `image` undistorts them."""
     cameras: Cameras
     """Poses and intrinsics, for the size to which images are resampled."""
     points: Float[Tensor, "m 3"]
     """Sparse surface points, world units; m may be 0."""
     point_colors: Float[Tensor, "m 3"]
-    """sRGB in [0, 1]."""
+    """Colours of the points, sRGB in [0, 1]."""
     mask_paths: tuple[Path | None, ...] = ()
-    """Object mask of each image, or None; the image's own path where its alpha channel is the mask; empty where the
-    capture has no masks."""
+    """Object mask of each image, or None; the image's own path if its alpha channel is the mask. Empty if the capture
+    has no masks."""
     distortions: tuple[Distortion | None, ...] = ()
-    """Lens distortion of each image file, removed on reading; empty where no file has any."""
+    """Lens distortion of each image file, removed on reading; empty if no file has any."""
     left_out: tuple[LeftOut, ...] = ()
-    """Images and masks that the capture's files name and that could not be used; remarks, no views."""
+    """Images and masks that the capture names but that cannot be used; for messages."""
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     def image(self, index: int) -> Float[Tensor, "h w 3"]:
-        """The image of camera `index`, sRGB, undistorted and resampled to that camera's size."""
+        """Read the image of camera `index`, sRGB, undistorted and resampled to the camera's size."""
         return self._resampled(read_stored_rgb(self.image_paths[index], self._size(index)), index)
 
     def reduced_image(self, index: int) -> Float[Tensor, "h w 3"]:
-        """The image, faster for a file that is much larger than the camera's size: it is decoded at less."""
+        """Read the image like `image`, but decode a file much larger than the camera's size at a reduced size."""
         size = self._size(index)
-        # the removal of distortion interpolates, which softens by less than a pixel of what it works on
+        # removing distortion interpolates, which softens less at twice the size
         factor = 2 if self.distortions and self.distortions[index] is not None else 1
         return self._resampled(read_stored_rgb(self.image_paths[index], size, longest_px=factor * max(size)), index)
 
     def mask(self, index: int) -> Float[Tensor, "h w"] | None:
-        """The object mask of camera `index` in [0, 1], or None."""
+        """Read the object mask of camera `index` in [0, 1], or None."""
         path = self.mask_paths[index] if self.mask_paths else None
         if path is None:
             return None
@@ -71,7 +71,7 @@ class PosedImages:
         return self._resampled(read_alpha(path, self._size(index)) if own else read_mask(path), index)
 
     def _size(self, index: int) -> tuple[int, int]:
-        """Width and height to which the image is resampled."""
+        """Return the width and height to which the image is resampled."""
         width, height = self.cameras.sizes[index].tolist()
         return width, height
 
@@ -83,7 +83,7 @@ class PosedImages:
         return resize(pixels, width, height)
 
     def select(self, which: Bool[Tensor, "v"]) -> "PosedImages":
-        """The views that the mask keeps; points stay."""
+        """Select views by a mask; points stay."""
         indices = [int(i) for i in torch.nonzero(which).flatten()]
         return replace(
             self,
@@ -94,19 +94,19 @@ class PosedImages:
         )
 
     def with_masks(self) -> "PosedImages":
-        """The views that have an object mask."""
+        """Select the views that have an object mask."""
         paths = self.mask_paths or (None,) * len(self)
         return self.select(torch.tensor([path is not None for path in paths], dtype=torch.bool))
 
     def resized(self, factor: float) -> "PosedImages":
-        """The same capture with images resampled by `factor`."""
+        """Resample all images by `factor`."""
         return replace(self, cameras=self.cameras.resized(factor))
 
     def limited(self, longest_px: int) -> "PosedImages":
-        """The same capture with each larger image resampled to this longest side."""
+        """Resample each larger image to this longest side."""
         return replace(self, cameras=self.cameras.limited(longest_px))
 
 
 def held_out(count: int, every: int = 8) -> Bool[Tensor, "v"]:
-    """Which of `count` views are for testing: every 8th from the first, as in Mip-NeRF 360."""
+    """Mark the test views among `count`: every 8th from the first, as in Mip-NeRF 360."""
     return torch.arange(count) % every == 0

@@ -1,4 +1,4 @@
-"""The value `ViewPrompt`: what a user says about the object in one picture, by points and a rectangle."""
+"""The value `ViewPrompt`: points and a rectangle by which a user marks the object in one picture."""
 
 from dataclasses import dataclass, field
 
@@ -19,14 +19,14 @@ class ViewPrompt:
     """Points on and beside the object and a rectangle around it, in one picture; each may be missing."""
 
     inside: Float[Tensor, "k 2"] = field(default_factory=_none)
-    """x and y of points on the object, pixels."""
+    """Points on the object, x and y, pixels."""
     outside: Float[Tensor, "m 2"] = field(default_factory=_none)
-    """x and y of points beside the object, pixels."""
+    """Points beside the object, x and y, pixels."""
     box: Rectangle | None = None
-    """Holds the whole object, as far as the picture shows it."""
+    """Rectangle around all of the object that the picture shows."""
 
     def scaled(self, x: float, y: float) -> "ViewPrompt":
-        """The same in a picture resampled by the factors `x` and `y`."""
+        """Scale to a picture resampled by the factors `x` and `y`."""
         factor = torch.tensor([x, y])
         box = None if self.box is None else (self.box[0] * x, self.box[1] * y, self.box[2] * x, self.box[3] * y)
         return ViewPrompt(self.inside * factor, self.outside * factor, box)

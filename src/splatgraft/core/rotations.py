@@ -10,7 +10,7 @@ from splatgraft.core.directions import perpendicular
 
 
 def rotation_from_quaternion(quaternions: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Rotation matrices of wxyz quaternions of any length but zero."""
+    """Convert wxyz quaternions of any length above zero to rotation matrices."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z),
@@ -27,7 +27,7 @@ def rotation_from_quaternion(quaternions: Float[Tensor, "n 4"]) -> Float[Tensor,
 
 
 def quaternion_from_rotation(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
-    """Unit wxyz quaternions of rotation matrices, w >= 0; stable for every rotation."""
+    """Convert rotation matrices to unit wxyz quaternions, w >= 0; stable for every rotation."""
     m = rotations
     d = torch.diagonal(m, dim1=-2, dim2=-1)
     x, y, z = d.unbind(-1)
@@ -50,7 +50,7 @@ def quaternion_from_rotation(rotations: Float[Tensor, "n 3 3"]) -> Float[Tensor,
 
 
 def rotation_about(axis: Float[Tensor, "3"], angle: float) -> Float[Tensor, "3 3"]:
-    """The rotation by `angle`, radians, counterclockwise about unit `axis`; computed in float64 (Rodrigues)."""
+    """Compute the rotation by `angle`, radians, counterclockwise about unit `axis`, in float64 (Rodrigues)."""
     x, y, z = axis.double().tolist()
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
     rotation = torch.eye(3, dtype=torch.float64) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
@@ -58,7 +58,7 @@ def rotation_about(axis: Float[Tensor, "3"], angle: float) -> Float[Tensor, "3 3
 
 
 def rotation_between(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The smallest rotation that takes unit `start` to unit `end`; where they are opposite, any half turn that does."""
+    """Compute the smallest rotation from unit `start` to unit `end`; if opposite, some half turn."""
     axis = torch.linalg.cross(start, end)
     sine, cosine = float(axis.norm()), float(start @ end)
     # below float32's rounding the axis has no direction
@@ -68,6 +68,6 @@ def rotation_between(start: Float[Tensor, "3"], end: Float[Tensor, "3"]) -> Floa
 
 
 def rotation_to_z(up: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """A rotation that takes unit `up` to +z; its rows are two perpendicular axes and `up`."""
+    """Compute a rotation that takes unit `up` to +z; its rows are two perpendicular axes and `up`."""
     x = -perpendicular(up)
     return torch.stack([x, torch.linalg.cross(up, x), up])

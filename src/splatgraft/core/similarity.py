@@ -14,22 +14,22 @@ from splatgraft.core.rotations import quaternion_from_rotation
 
 @dataclass(frozen=True)
 class Similarity:
-    """x_in_a = scale * rotation @ x_in_b + translation; variables are named a_from_b."""
+    """Transform x_in_a = scale * rotation @ x_in_b + translation; variables are named a_from_b."""
 
     scale: float
-    """Uniform, above zero."""
+    """Uniform scale, above zero."""
     rotation: Float[Tensor, "3 3"]
-    """Orthonormal, determinant 1."""
+    """Orthonormal matrix with determinant 1."""
     translation: Float[Tensor, "3"]
-    """In units of frame a."""
+    """Offset, units of frame a."""
 
     @staticmethod
     def identity() -> "Similarity":
-        """The identity transform."""
+        """Return the identity transform."""
         return Similarity(scale=1.0, rotation=torch.eye(3), translation=torch.zeros(3))
 
     def __matmul__(self, other: "Similarity") -> "Similarity":
-        """a_from_c = a_from_b @ b_from_c."""
+        """Compose a_from_c = a_from_b @ b_from_c."""
         return Similarity(
             scale=self.scale * other.scale,
             rotation=self.rotation @ other.rotation,
@@ -37,18 +37,18 @@ class Similarity:
         )
 
     def inverse(self) -> "Similarity":
-        """b_from_a."""
+        """Invert a_from_b to b_from_a."""
         rotation = self.rotation.T
         return Similarity(
             scale=1 / self.scale, rotation=rotation, translation=-(rotation @ self.translation) / self.scale
         )
 
     def points(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Points of frame b in frame a."""
+        """Transform points from frame b to frame a."""
         return self.scale * points @ self.rotation.to(points).T + self.translation.to(points)
 
     def gaussians(self, gaussians: Gaussians) -> Gaussians:
-        """Gaussians of frame b in frame a; all SH bands are rotated."""
+        """Transform Gaussians from frame b to frame a; all SH bands are rotated."""
         if self.is_identity:
             return gaussians
         rotation = self.rotation.to(gaussians.means)
@@ -61,7 +61,7 @@ class Similarity:
         )
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """Cameras of frame b in frame a; they see the transformed scene as the original cameras see the original."""
+        """Transform cameras from frame b to frame a; they see the transformed scene as these see the original."""
         poses = cameras.world_from_camera.clone()
         poses[:, :3, :3] = self.rotation.to(poses) @ poses[:, :3, :3]
         poses[:, :3, 3] = self.points(poses[:, :3, 3])
@@ -69,7 +69,7 @@ class Similarity:
 
     @property
     def is_identity(self) -> bool:
-        """Whether this is exactly the identity."""
+        """Whether the transform is exactly the identity."""
         return (
             self.scale == 1.0
             and torch.equal(self.rotation, torch.eye(3).to(self.rotation))

@@ -26,14 +26,14 @@ _C3 = (
 
 
 def coefficient_count(degree: int) -> int:
-    """Number of coefficients k of all bands up to `degree`."""
+    """Return the number of coefficients of all bands up to `degree`."""
     return (degree + 1) ** 2
 
 
 def degree_of(coefficients: int) -> int:
-    """Degree of an expansion with `coefficients` coefficients.
+    """Return the degree of an expansion with `coefficients` coefficients.
 
-    Raises: ValueError where the number is not 1, 4, 9 or 16.
+    Raises: ValueError if the number is not 1, 4, 9 or 16.
     """
     degree = math.isqrt(coefficients) - 1
     if not 0 <= degree <= MAX_DEGREE or coefficient_count(degree) != coefficients:
@@ -42,7 +42,7 @@ def degree_of(coefficients: int) -> int:
 
 
 def basis(directions: Float[Tensor, "*n 3"], degree: int) -> Float[Tensor, "*n k"]:
-    """Basis values at unit `directions`, k = (degree + 1)^2."""
+    """Evaluate the basis at unit `directions`; k = (degree + 1)^2."""
     x, y, z = directions.unbind(-1)
     values = [torch.full_like(x, C0)]
     if degree >= 1:
@@ -71,29 +71,29 @@ def basis(directions: Float[Tensor, "*n 3"], degree: int) -> Float[Tensor, "*n k
 
 
 def band_from_slope(slope: Float[Tensor, "*n 3 c"]) -> Float[Tensor, "*n 3 c"]:
-    """Coefficients of band 1 whose value along the unit vector d is slope . d; world axes first."""
+    """Compute coefficients of band 1 whose value along unit d is slope . d; `slope` has the world's axes first."""
     x, y, z = slope.unbind(-2)
     return torch.stack([-y, z, -x], -2) / _C1
 
 
 def colors(sh: Float[Tensor, "n k 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """sRGB seen along unit `directions` (from the camera to the Gaussian): the expansion plus one half, at least 0."""
+    """Evaluate sRGB along unit `directions`, camera to Gaussian: the expansion plus one half, at least 0."""
     values = basis(directions, degree_of(sh.shape[1]))
     return (torch.einsum("nk,nkc->nc", values, sh) + 0.5).clamp_min(0)
 
 
 def dc_from_rgb(rgb: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
-    """Band-0 coefficient of a colour that does not depend on the view."""
+    """Compute the band-0 coefficient of a view-independent colour."""
     return (rgb - 0.5) / C0
 
 
 def rgb_from_dc(dc: Float[Tensor, "*n c"]) -> Float[Tensor, "*n c"]:
-    """Mean colour over all directions of an expansion with band 0 `dc`."""
+    """Compute the mean colour over all directions from the band-0 coefficient `dc`."""
     return dc * C0 + 0.5
 
 
 def with_degree(sh: Float[Tensor, "n k 3"], degree: int) -> Float[Tensor, "n j 3"]:
-    """The expansion cut or zero-padded to `degree`, j = (degree + 1)^2."""
+    """Cut or zero-pad the expansion to `degree`; j = (degree + 1)^2."""
     count = coefficient_count(degree)
     if count <= sh.shape[1]:
         return sh[:, :count]
@@ -101,9 +101,9 @@ def with_degree(sh: Float[Tensor, "n k 3"], degree: int) -> Float[Tensor, "n j 3
 
 
 def rotation_matrix(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor, "k k"]:
-    """Matrix D with f'(d) = f(R^T d) when coefficients are c' = D c; block-diagonal by band, float64.
+    """Compute the matrix D of f'(d) = f(R^T d), c' = D c; block-diagonal by band, float64.
 
-    Solved from the basis at 64 directions of a Fibonacci lattice; exact, since every band is closed under rotation.
+    It is solved from the basis at 64 directions of a Fibonacci lattice; exact, because bands are closed under rotation.
     """
     rotation = rotation.detach().to("cpu", torch.float64)
     i = torch.arange(64, dtype=torch.float64)
@@ -121,6 +121,6 @@ def rotation_matrix(rotation: Float[Tensor, "3 3"], degree: int) -> Float[Tensor
 
 
 def rotate(sh: Float[Tensor, "n k 3"], rotation: Float[Tensor, "3 3"]) -> Float[Tensor, "n k 3"]:
-    """Coefficients of the same radiance after the object that emits it is rotated by `rotation`."""
+    """Rotate the expansion, as if the object that emits this radiance were rotated by `rotation`."""
     matrix = rotation_matrix(rotation, degree_of(sh.shape[1])).to(sh)
     return torch.einsum("jk,nkc->njc", matrix, sh)

@@ -17,10 +17,10 @@ PIECES = 5
 PIECE_WIDTH = 0.55
 """Width of a piece along the split axis, over the width of the whole."""
 
-# Five Gaussians of 0.55 sigma along the axis whose blended alpha in the plane is nearest to that of one of sigma 1, by
-# opacity of the whole (least squares of alpha; rms error up to 0.008, largest 0.05, both for the most opaque). In
-# optical depth, -log(1 - alpha), pieces add up, so their order does not matter. Columns: opacity of the whole; of the
-# middle, inner and outer piece; places of inner and outer; width of a piece across the axis.
+# Five Gaussians of 0.55 sigma whose blended alpha is nearest to that of the whole, by least squares; the rms error is
+# up to 0.008, the largest 0.05, both for the most opaque. Their optical depths, -log(1 - alpha), add up in any order.
+# Columns: opacity of the whole; of the middle, inner and outer piece; places of inner and outer piece along the axis
+# and width of a piece across it, both over the whole's.
 _TABLE = (
     (0.00, 0.0000, 0.0000, 0.0000, 0.8230, 1.7401, 1.0000),
     (0.05, 0.0357, 0.0228, 0.0051, 0.8230, 1.7401, 0.9972),
@@ -36,7 +36,7 @@ _TABLE = (
 
 
 def split_along(gaussians: Gaussians, axis: Int[Tensor, "n"]) -> tuple[Gaussians, Int[Tensor, "m"]]:
-    """Split each Gaussian into five along an axis of its own (0, 1 or 2): the m = 5 n pieces, and the whole of each."""
+    """Split each Gaussian into five along its own axis 0, 1 or 2; returns m = 5 n pieces and their origins."""
     n = gaussians.count
     columns = _pieces_by_opacity(gaussians.opacities.clamp_max(0.99))
     opacities = columns[:, [2, 1, 0, 1, 2]].clamp(1e-6, 0.9999)
@@ -58,7 +58,7 @@ def split_along(gaussians: Gaussians, axis: Int[Tensor, "n"]) -> tuple[Gaussians
 
 
 def _pieces_by_opacity(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 6"]:
-    """Columns 2 to 7 of the table, interpolated linearly."""
+    """Interpolate columns 2 to 7 of the table linearly."""
     table = torch.tensor(_TABLE).to(opacities)
     above = torch.searchsorted(table[:, 0].contiguous(), opacities.contiguous()).clamp(1, len(table) - 1)
     low, high = table[above - 1], table[above]
@@ -67,13 +67,13 @@ def _pieces_by_opacity(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 6"]:
 
 
 # which Gaussians around an object are split; set by hand on the benchmark scenes
-_MIN_WIDTH = 0.25  # least standard deviation along the widest axis, object radii
+_MIN_WIDTH = 0.25  # minimum standard deviation along the widest axis, object radii
 _MIN_OPACITY = 0.02  # fainter Gaussians are not split
-_REACH = 1.5  # largest distance of a centre from the object's, object radii; two standard deviations are added to it
-_FARTHEST = 6.0  # largest distance of a centre in any case, object radii
-_ROUNDS = 6  # how many times the pieces that are still too wide are split again, at most
+_REACH = 1.5  # largest distance of a centre from the object's, object radii, plus two standard deviations
+_FARTHEST = 6.0  # largest distance of any centre, object radii
+_ROUNDS = 6  # maximum number of splits of a Gaussian and its pieces
 _MAX_PER_ROUND = 4000
-"""Most Gaussians split per round and object; a scene of a million small Gaussians has none that wide."""
+"""Maximum number of Gaussians split per round and object; a scene of a million small Gaussians has none that wide."""
 
 
 def split_wide_around(
@@ -82,8 +82,8 @@ def split_wide_around(
     """Split the wide Gaussians of a composite's target that lie around its placed objects.
 
     Renderers blend Gaussians in the order of their centres. A plain table is reconstructed with Gaussians wider than
-    the objects on it, and one of them whose centre is nearer to the camera than the object covers the object's foot,
-    though it lies below. Gaussians of objects, and all that are not split, keep every bit and their order.
+    the objects on it. If the centre of one is nearer to the camera than the object, it covers the object's foot,
+    although it lies below. All Gaussians that are not split keep every bit and their order.
     """
     for one in objects:
         if not one.count:
