@@ -1,5 +1,6 @@
 """Segment: from object masks of a capture's images to the Gaussians of the object."""
 
+from splatgraft.segmentation.capture_masks import CUT_SIDE_PX, CutRequest, cut_capture, network_masks
 from splatgraft.segmentation.cut_object import (
     MIN_AGREEMENT,
     Agreement,
@@ -25,11 +26,13 @@ from splatgraft.segmentation.solidify import SolidifyOptions, solidify_object
 from splatgraft.segmentation.unseen_side import WIDE_GAP_DEG, ClosedObject, close_unseen_side, widest_gap
 
 __all__ = [
+    "CUT_SIDE_PX",
     "MIN_AGREEMENT",
     "WIDE_GAP_DEG",
     "Agreement",
     "Box",
     "ClosedObject",
+    "CutRequest",
     "CutViews",
     "Keep",
     "LiftOptions",
@@ -41,6 +44,7 @@ __all__ = [
     "add_correction",
     "apply_corrections",
     "close_unseen_side",
+    "cut_capture",
     "cut_object",
     "default_box",
     "grabcut_mask",
@@ -48,6 +52,7 @@ __all__ = [
     "load_birefnet",
     "load_sam2",
     "measure_agreement",
+    "network_masks",
     "seed_selection",
     "segment",
     "select_object",

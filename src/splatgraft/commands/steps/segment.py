@@ -19,15 +19,12 @@ from splatgraft.core.images import resize, write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import capture_inputs, read_view_gains
 from splatgraft.folders.object_masks import (
-    CUT_SIDE_PX,
-    CutRequest,
     MaskedViews,
     MaskSource,
-    cut_masks,
     masked_views,
-    network_masks,
     with_mask_folder,
     write_mask_sheet,
+    write_masks,
 )
 from splatgraft.folders.picture_points import prompts_by_view
 from splatgraft.formats import read_capture, read_gaussians, write_gaussians
@@ -39,10 +36,12 @@ from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft.runtime.note import Note
 from splatgraft.segmentation import (
+    CUT_SIDE_PX,
     MIN_AGREEMENT,
     WIDE_GAP_DEG,
     Agreement,
     Box,
+    CutRequest,
     Keep,
     LiftOptions,
     SelectOptions,
@@ -50,10 +49,12 @@ from splatgraft.segmentation import (
     ViewCutter,
     apply_corrections,
     close_unseen_side,
+    cut_capture,
     grabcut_mask,
     lift_masks,
     load_sam2,
     measure_agreement,
+    network_masks,
     select_object,
     solidify_object,
     widest_gap,
@@ -178,16 +179,15 @@ class Segment:
         if source == "files":
             return masked_views(with_mask_folder(capture, self.masks, self.capture))
         if source == "birefnet":
-            return network_masks(capture, weights=self.birefnet, folder=made, progress=context.progress)
+            return write_masks(made, capture, network_masks(capture, weights=self.birefnet, progress=context.progress))
         prompts = None
         if self.prompts is not None:
             prompts = prompts_by_view(capture, read_prompts(self.prompts), self.prompts)
         if self.mask_source == "auto":
             context.console.say(f"{self.capture}: no masks for all images; they are cut by grabcut")
         request = CutRequest(self._cutter(source), box, prompts)
-        masked = cut_masks(capture, scene, request, folder=made, progress=context.progress)
-        region = masked.region
-        assert region is not None
+        masks, region = cut_capture(capture, scene, request, progress=context.progress)
+        masked = write_masks(made, capture, masks, region=region)
         size = " x ".join(f"{x:.3g}" for x in (region.box.upper - region.box.lower).tolist())
         context.console.say(f"the object was looked for in {region.reason}, a box of {size}")
         if not region.is_whole:
