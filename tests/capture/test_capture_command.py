@@ -51,7 +51,7 @@ def change(folder: Path, *frames: int, **keys: object) -> None:
 def test_a_capture_with_plenty_of_photos_is_not_in_doubt_for_those_left_out(kept: int, level: str) -> None:
     left_out = [LeftOut(f"{i}.jpg", f"{i}.jpg: expected an image file, found none") for i in range(17)]
     head, _ = left_out_notes(Path("fox"), kept, left_out)
-    assert (head.level, f"goes on with {kept} of {kept + 17} images" in head.text) == (level, True)
+    assert (head.level, f"uses {kept} of {kept + 17} images" in head.text) == (level, True)
 
 
 def test_what_is_not_usable_is_named_counted_and_left_out(tmp_path: Path, capture) -> None:
@@ -64,7 +64,7 @@ def test_what_is_not_usable_is_named_counted_and_left_out(tmp_path: Path, captur
     said = capture()
     assert read_capture(tmp_path / "out").cameras.names == tuple(p.name for p in (photos[0], *photos[6:]))
     head = next(line for line in said.splitlines() if "warning" in line)
-    assert "goes on with 9 of 14 images" in head
+    assert "uses 9 of 14 images" in head
     assert all(f"{i:04d}.png" in head for i in range(1, 6))
     for reason in ("found none in", "truncated", "found 1x1", "finite numbers", "a copy of it"):
         assert reason in said
@@ -113,7 +113,7 @@ def test_masks_of_one_colour_or_another_size_are_left_out(tmp_path: Path, captur
     said = capture()
     found = read_capture(tmp_path / "out")
     assert [path is None for path in found.mask_paths] == [False, True, True, True, *[False] * 6]
-    assert "goes on with 10 of 10 images, without the mask of images/0003.png, the mask of 0001.png" in said
+    assert "uses 10 of 10 images, without the mask of images/0003.png, the mask of 0001.png" in said
     assert "0001.png: expected white where the object is, found black all over" in said
     assert "0002.png: expected white where the object is, found white all over" in said
     assert "0003.png: expected 160x120 px" in said

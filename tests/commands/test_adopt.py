@@ -26,7 +26,7 @@ def test_each_format_becomes_a_scene_and_says_its_axes(tmp_path, capsys, name):
     assert torch.equal(found.means, formats.read_gaussians(TOOLS / name).means)
     said = capsys.readouterr().err
     assert "40 Gaussians, SH degree" in said
-    assert f"its axes are taken to be {formats.read_scene(TOOLS / name).axes}" in said
+    assert f"its axes are read as {formats.read_scene(TOOLS / name).axes}" in said
 
 
 def test_axes_are_named_by_hand(tmp_path):

@@ -321,7 +321,7 @@ def test_what_is_not_there_is_named(tmp_path, read, name):
 
 def test_splat_of_no_numbers_and_compressed_ply_without_its_chunks(tmp_path):
     (tmp_path / "a.splat").write_bytes(struct.pack("<3f", 1, float("nan"), 0) + bytes(20))
-    assert "is this a .splat?" in refused(tmp_path / "a.splat")
+    assert "is it another format?" in refused(tmp_path / "a.splat")
     data = (format_files.GOLDEN / "supersplat.compressed.ply").read_bytes()
     (tmp_path / "a.ply").write_bytes(data.replace(b"element chunk", b"element chink"))
-    assert "expected one chunk for 256 packed Gaussians, found 0" in refused(tmp_path / "a.ply")
+    assert "expected an element 'chunk', found ['chink'" in refused(tmp_path / "a.ply")

@@ -1,1 +1,1 @@
-"""Reading and writing of the folders and files that several steps share: composites, rendered views, masks."""
+"""Folders and files that several steps share: composites, rendered views, masks."""

@@ -1,4 +1,4 @@
-"""The files that a capture consists of, from which steps detect that it changed, and what is said of its photos."""
+"""Files of a capture, by which steps detect changes, and notes on its photos."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,9 +11,9 @@ from splatgraft.formats.captures import find_poses
 from splatgraft.formats.captures.exif import read_exposure
 from splatgraft.runtime.note import Note
 
-_NAMED = 8  # most images that a message names
-_PLENTY = 40  # images that are enough whatever is left out
-_FEW = 4  # photos kept per photo left out from which on the capture is not in doubt; set by hand
+_NAMED = 8  # maximum number of images that a message names
+_PLENTY = 40  # kept photos above which left-out ones are no warning
+_FEW = 4  # kept photos per left-out one above which that is no warning; set by hand
 
 
 def has_poses(path: Path) -> bool:
@@ -22,7 +22,7 @@ def has_poses(path: Path) -> bool:
 
 
 def description_files(path: Path) -> tuple[Path, ...]:
-    """The files with poses and points: all in the folder except images, step.json and hidden files."""
+    """List the files with poses and points: all in the folder except images, step.json and hidden files."""
     if path.is_file():
         return (path,)
     if not path.is_dir():
@@ -33,7 +33,7 @@ def description_files(path: Path) -> tuple[Path, ...]:
 
 
 def capture_inputs(path: Path, capture: PosedImages, *, masks: bool = False) -> dict[str, tuple[Path, ...]]:
-    """All input files of a step that reads `capture` from `path`, by role."""
+    """List all input files of a step that reads `capture` from `path`, by role."""
     inputs = {"capture": description_files(path), "images": tuple(capture.image_paths)}
     if masks:
         inputs["masks"] = tuple(p for p in capture.mask_paths if p is not None)
@@ -41,7 +41,7 @@ def capture_inputs(path: Path, capture: PosedImages, *, masks: bool = False) -> 
 
 
 def unposed_notes(path: Path, capture: PosedImages) -> list[Note]:
-    """A warning where most of the images beside those of the capture at `path` have no pose."""
+    """Warn if most of the images in the folders of the capture at `path` have no pose."""
     folders = {image.parent for image in capture.image_paths}
     total = sum(len(list_images(folder)) for folder in folders)
     if len(capture) >= 0.5 * total:
@@ -51,7 +51,7 @@ def unposed_notes(path: Path, capture: PosedImages) -> list[Note]:
 
 
 def camera_files(path: Path) -> tuple[Path, ...]:
-    """The files that the cameras of `path`, a file or a folder of a capture, are read from."""
+    """List the files that hold the cameras of `path`, a file or a folder of a capture."""
     if not path.is_dir():
         return (path,)
     found = find_poses(path)
@@ -63,40 +63,40 @@ def camera_files(path: Path) -> tuple[Path, ...]:
 
 
 def left_out_notes(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[Note]:
-    """What of the capture at `path` is not used: a warning with number and names, then a note per kind of reason."""
+    """Describe the unused images of the capture at `path`: number and names, then a note per kind of reason."""
     if not left_out:
         return []
     total = kept + sum(not one.mask_only for one in left_out)
     more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
     names = ", ".join(str(one) for one in left_out[:_NAMED])
-    head = f"{path}: goes on with {kept} of {total} images, without {names}{more}"
-    alike: dict[str, list[str]] = {}
+    head = f"{path}: uses {kept} of {total} images, without {names}{more}"
+    by_kind: dict[str, list[str]] = {}
     for one in left_out:
-        alike.setdefault(one.reason.replace(one.name, ""), []).append(one.reason)
+        by_kind.setdefault(one.reason.replace(one.name, ""), []).append(one.reason)
     lines = [
-        f"left out: {reasons[0]}" + (f" (and {len(reasons) - 1} more alike)" if len(reasons) > 1 else "")
-        for reasons in alike.values()
+        f"left out: {reasons[0]}" + (f" (and {len(reasons) - 1} more like it)" if len(reasons) > 1 else "")
+        for reasons in by_kind.values()
     ]
     level = "minor" if _FEW * len(left_out) <= kept or kept >= _PLENTY else "warning"
     return [Note(head, level), *(Note(line) for line in lines[:_NAMED])]
 
 
 def exposure_notes(name: Path, photos: Sequence[Path]) -> list[Note]:
-    """At most one warning that starts with `name`: exposures of photos differ, or white balance was automatic."""
+    """Warn, with `name` first, if exposures of photos differ or white balance was automatic."""
     found = describe_inconsistency([read_exposure(photo) for photo in photos])
     return [] if found is None else [Note(f"{name}: {found}", "minor")]
 
 
 def read_view_gains(photos: Sequence[Path]) -> list[float] | None:
-    """The brightness of each photo over their mean by its settings; None where exposure and white balance are alike."""
+    """Read the brightness of each photo over their mean, by its settings; None if the settings are constant."""
     exposures = [read_exposure(photo) for photo in photos]
     return None if describe_inconsistency(exposures) is None else relative_gains(exposures)
 
 
 def read_luminance_scale(cameras: Path) -> LuminanceScale | None:
-    """The luminance behind the values of a capture; None where its images do not exist or have no exposure data."""
+    """Read the luminance scale of a capture; None if its images do not exist or have no exposure data."""
     photos = list_capture_images(cameras)
     exposures = [read_exposure(photo) for photo in photos]
     if all(one.ev100 is None for one in exposures):
-        return None  # no pixels need be read
+        return None  # before any pixels are read
     return luminance_scale(exposures, [mean_luminance(photo) for photo in photos])

@@ -1,7 +1,7 @@
-"""The folder of a composite: placement.json, and the scene that it describes as scene.ply with is_object.npy.
+"""The folder of a composite: placement.json, and the baked scene as scene.ply with is_object.npy.
 
-placement.json and the target's scene.ply are what `relight` reads: it needs the objects apart and no Gaussian split.
-scene.ply is the baked composite, for `render`, `evaluate` and other programs; changing it changes no light transfer.
+- `relight` reads placement.json and the target's scene.ply, because it needs separate objects and unsplit Gaussians.
+- `render`, `evaluate` and other programs read the baked scene.ply; it has no effect on the light transfer.
 """
 
 from collections.abc import Mapping
@@ -20,18 +20,18 @@ from splatgraft.project.layout import ERASED_FILE, IS_GUESSED_FILE, IS_OBJECT_FI
 from splatgraft.project.placement import Placement, read_placement, write_placement
 
 _ONE_SIDED = 0.25
-"""Distance of what was guessed from the object's middle, over its radius, from which on one side is it; set by hand."""
+"""Offset of the guessed surface, in object radii, above which only one side counts as photographed; set by hand."""
 
 
 def placement_files(path: Path) -> tuple[Path, ...]:
-    """placement.json and all files that it names."""
+    """List placement.json and all files that it names."""
     placement = read_placement(path)
     erased = (path.parent / ERASED_FILE,) if placement.erased is not None else ()
     return (path, *erased, *(item.object_path for item in placement.objects if item.object_path is not None))
 
 
 def read_composite(target: Path, placement: Path) -> Composite:
-    """The composite of a target scene and the objects that a placement names."""
+    """Read the composite of a target scene and the objects that a placement names."""
     found = read_placement(placement)
     for index, item in enumerate(found.objects):
         if item.object_path is None:
@@ -42,7 +42,7 @@ def read_composite(target: Path, placement: Path) -> Composite:
 def composite_of(
     target: Gaussians, placement: Placement, *, known: Mapping[Path, Gaussians] = MappingProxyType({})
 ) -> Composite:
-    """The composite of a target scene and the objects that `placement` names, each file read once.
+    """Compose a target scene and the objects that `placement` names; each file is read once.
 
     `known` holds scenes that were read before, by path.
     """
@@ -57,14 +57,14 @@ def composite_of(
 
 
 def guessed_gaussians(folder: Path, is_object: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
-    """Which Gaussians of a composite's scene close the side of an object that no photograph shows.
+    """Mark the Gaussians of a composite's scene that close a side of an object that no photograph shows.
 
     Args:
-        folder: The composite's; its placement.json names the objects, and is_guessed.npy beside an object says it.
-        is_object: Which Gaussians of its scene are the objects'.
+        folder: Folder of the composite; its placement.json names the objects, which have is_guessed.npy beside them.
+        is_object: Mask of the objects' Gaussians in the scene.
 
     Returns:
-        None of them for an object without that file, and where the files are not of this composite.
+        A mask of the scene's Gaussians; all false if an object has no such file, or the files do not fit the scene.
     """
     guessed = torch.zeros_like(is_object)
     if (folder / PLACEMENT_FILE).is_file():
@@ -79,7 +79,7 @@ def guessed_gaussians(folder: Path, is_object: Bool[Tensor, "n"]) -> Bool[Tensor
 def photographed_side(
     scene: Gaussians, is_object: Bool[Tensor, "n"], is_guessed: Bool[Tensor, "n"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "3"] | None:
-    """Horizontal unit vector from what was guessed of an object to its middle; None where it is seen from all sides."""
+    """Compute the horizontal unit vector from the guessed surface to the object's median; None without a clear side."""
     if not bool(is_guessed.any()):
         return None
     middle = scene.means[is_object].median(0).values

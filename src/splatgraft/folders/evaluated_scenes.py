@@ -1,4 +1,4 @@
-"""Pictures of the same views of result, composite and target, and of the ground truth where there is one."""
+"""Pictures of the same views of result, composite, target and, if there is one, ground truth."""
 
 import math
 from collections.abc import Sequence
@@ -22,11 +22,10 @@ from splatgraft.project.layout import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
 from splatgraft.rendering import render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
-_CUT_OBJECT = 0.05  # what the coverage of an object counts that the picture's rim cuts; set by hand
-_GUESSED_POWER = 4
-"""Of the share that was photographed: a view that shows a fifth of guesses counts four tenths; set by hand."""
-_LOOK_PX, _LOOKED_AT = 160, 40
-"""Longest side at which views are looked at for the best one, and how many at most."""
+_CUT_OBJECT = 0.05  # factor on the prominence of an object that the image border cuts; set by hand
+_GUESSED_POWER = 4  # of the photographed share: 0.8 counts 0.4; set by hand
+_LOOK_PX = 160  # longest side of the views among which the best is sought
+_LOOKED_AT = 40  # maximum number of these views
 
 
 @dataclass(frozen=True)
@@ -34,43 +33,43 @@ class Pictures:
     """One view before and after the transfer; sRGB in [0, 1]."""
 
     name: str
-    """The view's name."""
+    """Name of the view."""
     before: Float[Tensor, "h w 3"]
-    """The target without the object."""
+    """Target without the object."""
     copy_paste: Float[Tensor, "h w 3"]
-    """The object as it was captured."""
+    """Composite with the object as captured, without relighting."""
     result: Float[Tensor, "h w 3"]
-    """The final scene."""
+    """Final scene."""
     mask: Float[Tensor, "h w"]
-    """The object's coverage."""
+    """Coverage of the object, in [0, 1]."""
     truth: Float[Tensor, "h w 3"] | None = None
-    """The image with the object really there; None where there is no ground truth."""
+    """Photograph with the real object; None without ground truth."""
     held_out: bool = False
     """Whether the consolidation used no image of this view."""
     guessed_share: float = 0.0
-    """Of the object's coverage, how much is of what no photograph shows, in [0, 1]."""
+    """Share of the object's coverage that no photograph shows, in [0, 1]."""
 
     @property
     def prominence(self) -> float:
-        """How well the view shows the object: its coverage, pixels, the less the more of it no photograph shows; a
-        twentieth of it where the picture's rim cuts it."""
+        """Visibility of the object in the view: its coverage, pixels, reduced for guessed parts, and if the border cuts
+        it."""
         return _prominence(self.mask, self.guessed_share)
 
 
 @dataclass(frozen=True)
 class EvaluatedScenes:
-    """The compared scenes, on one device."""
+    """Compared scenes, on one device."""
 
     result: Gaussians
-    """After consolidation."""
+    """Scene after consolidation."""
     composite: Gaussians
-    """The object as it was captured, in the target."""
+    """Target with the object as captured."""
     is_object: Bool[Tensor, "n"]
-    """Which Gaussians of the composite are the object's."""
+    """Mask of the object's Gaussians in the composite."""
     is_guessed: Bool[Tensor, "n"]
-    """Which of these close the side that no photograph shows."""
+    """Mask of those that close the side that no photograph shows."""
     cameras: Cameras
-    """The target's."""
+    """Cameras of the target."""
 
     @staticmethod
     def read(result: Path, composite: Path, cameras: Path, *, device: torch.device) -> "EvaluatedScenes":
@@ -86,37 +85,37 @@ class EvaluatedScenes:
         )
 
     def with_width(self, width: int | None) -> "EvaluatedScenes":
-        """The same with pictures `width` pixels wide; unchanged where it is None."""
+        """Resize the cameras to `width` pixels; no change if it is None."""
         if width is None:
             return self
         return replace(self, cameras=self.cameras.resized(width / float(self.cameras.sizes[:, 0].max())))
 
     @property
     def object_center(self) -> Float[Tensor, "3"]:
-        """The median of the centres of the object's Gaussians; of all Gaussians where there is no object."""
+        """Median of the object's Gaussians, world units; of all Gaussians if there is no object."""
         chosen = self.composite.select(self.is_object) if bool(self.is_object.any()) else self.composite
         return chosen.means.median(0).values
 
     @property
     def photographed_side(self) -> Float[Tensor, "3"] | None:
-        """Horizontal direction from the object to the side that was photographed; None where all were."""
+        """Horizontal direction from the object to the photographed side; None if all sides were photographed."""
         up = estimate_up(self.cameras).to(self.composite.means)
         return photographed_side(self.composite, self.is_object, self.is_guessed, up)
 
     def picture(self, scene: Gaussians, camera: Cameras) -> Float[Tensor, "h w 3"]:
-        """One view of one scene, clamped to [0, 1], on the CPU."""
+        """Render one view of one scene, clamped to [0, 1], on the CPU."""
         color = render(scene, camera).color
         return color[0].cpu().clamp(0, 1)
 
     @property
     def best_view(self) -> int:
-        """Which of the cameras, or of `_LOOKED_AT` of them, shows the object best, as `Pictures.prominence` has it."""
+        """Index of the camera with the largest `Pictures.prominence`, among at most `_LOOKED_AT`."""
         small = self.cameras.resized(min(1.0, _LOOK_PX / int(self.cameras.sizes.max())))
         every = math.ceil(len(small) / _LOOKED_AT)
         return max(range(0, len(small), every), key=lambda index: _prominence(*self._object_from(small[index])))
 
     def pictures_from(self, camera: Cameras) -> Pictures:
-        """One view from any camera."""
+        """Render the pictures of one view."""
         object_, guessed_share = self._object_from(camera)
         return Pictures(
             name=camera.names[0],
@@ -128,7 +127,7 @@ class EvaluatedScenes:
         )
 
     def _object_from(self, camera: Cameras) -> tuple[Float[Tensor, "h w"], float]:
-        """The object's coverage, and how much of it no photograph shows."""
+        """Render the object's coverage, and compute the share of it that no photograph shows."""
         flags = torch.stack([self.is_object, self.is_guessed], 1).float()
         drawn = render(self.composite, camera, features=flags, outputs=frozenset())
         object_, guessed = drawn.features[0].cpu().clamp(0, 1).unbind(-1)
@@ -143,19 +142,20 @@ def _prominence(mask: Float[Tensor, "h w"], guessed_share: float) -> float:
 
 @dataclass(frozen=True)
 class TrueViews:
-    """The images of a ground truth, matched with those of the target without the object."""
+    """Images of a ground truth, matched with images of the target without the object."""
 
     truth: PosedImages
-    """With the object really there, and a mask for every view."""
+    """Photographs with the real object, and a mask for every view."""
     target: PosedImages
+    """Photographs without the object."""
     backgrounds: tuple[int, ...]
-    """For each view of the truth the index of the target's image of the same name."""
+    """Index of the target's image of the same name, for each view of the truth."""
     harmonized_stems: frozenset[str]
-    """Views that the consolidation used, without suffix."""
+    """Names, without suffix, of the views that the consolidation used."""
 
     @staticmethod
     def read(truth: Path, target_capture: Path | None, harmonized: Path | None) -> "TrueViews":
-        """Match the views of the truth with the target's."""
+        """Read the ground truth, and match its views with the target's."""
         views = read_images(truth)
         if target_capture is None:
             raise ValueError("--ground-truth: expected --target-capture, the images without the object, found none")
@@ -174,13 +174,13 @@ class TrueViews:
         )
 
     def pictures(self, scenes: EvaluatedScenes, index: int) -> Pictures:
-        """One view with its truth."""
+        """Render the pictures of one view of the ground truth."""
         shown = scenes.pictures_from(self.truth.cameras[index].to(scenes.result.device))
         held_out = Path(shown.name).stem not in self.harmonized_stems
         return replace(shown, truth=self.truth.image(index), held_out=held_out)
 
     def compared(self, scenes: EvaluatedScenes) -> Sequence[ComparedView]:
-        """Every view with renders from the same camera, made when asked for."""
+        """Pair every view with renders from the same camera, made on access."""
         return LazySequence(len(self.truth), lambda index: self._compared(scenes, index))
 
     def _compared(self, scenes: EvaluatedScenes, index: int) -> ComparedView:
@@ -199,7 +199,7 @@ class TrueViews:
 
 
 def truth_files(truth: Path | None, target_capture: Path | None) -> tuple[Path, ...]:
-    """All files of the ground truth and of the images without the object."""
+    """List all files of the ground truth and of the images without the object."""
     files: list[Path] = []
     for path in (truth, target_capture):
         if path is not None:

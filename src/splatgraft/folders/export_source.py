@@ -1,4 +1,4 @@
-"""Reads what is to be exported: a scene file, the folder of a result, or a whole project."""
+"""Sources of an export: a scene file, the folder of a result, or a whole project."""
 
 from pathlib import Path
 
@@ -27,12 +27,12 @@ from splatgraft.project.placement import read_placement
 
 
 def read_export_source(path: Path, *, cameras: Path | None = None) -> ExportSource:
-    """What is known of a scene, a result or a project.
+    """Read a scene, a result or a project for export.
 
     Args:
-        path: A scene file, a folder with scene.ply, a project's folder or its project.toml. Of a project, and of the
-            folders that `relight` and `consolidate` made in one, the scene before the transfer and its parts are known.
-        cameras: The capture that a scene was made from, in its frame; found in a project.
+        path: A scene file, a folder with scene.ply, a project's folder or its project.toml. For a project, and for the
+            folders of `relight` and `consolidate` in it, the parts and the scene before the transfer are read as well.
+        cameras: Capture of the scene, in the same frame; a project's own if None.
     """
     if path.name == PROJECT_FILE:
         path = path.parent
@@ -54,7 +54,7 @@ def read_export_source(path: Path, *, cameras: Path | None = None) -> ExportSour
 
 
 def project_of(path: Path) -> Path | None:
-    """The project whose transfer `path` shows: itself, or the folder of one of its last two results."""
+    """Find the project of `path`: the project's folder, or the folder of its relit or consolidated result."""
     for root, result in ((path, path / "relit"), (path.parent, path)):
         layout = Layout(root)
         known = result in (layout.relit, layout.result)
@@ -78,7 +78,7 @@ def _of_scene(path: Path, capture: Path | None) -> ExportSource:
 
 
 def _of_project(layout: Layout, last: Path, capture: Path | None) -> ExportSource:
-    """The last result beside the composite; consolidation keeps the order and the number of the relit Gaussians."""
+    """Read the last result and the composite; consolidation keeps order and number of the relit Gaussians."""
     scene = read_gaussians(last / SCENE_FILE)
     is_object = read_selection(layout.relit / IS_OBJECT_FILE, scene.count, last / SCENE_FILE)
     capture = layout.capture("target") if capture is None else capture
@@ -114,6 +114,6 @@ def _up(cameras: Cameras) -> tuple[float, float, float]:
 
 
 def _title(path: Path) -> str:
-    """The name of a file or folder as words."""
+    """Make a title of the name of a file or folder."""
     name = path.parent.name if path.name == SCENE_FILE and path.parent.name else path.stem
     return name.replace("_", " ").replace("-", " ").strip().capitalize() or "Scene"

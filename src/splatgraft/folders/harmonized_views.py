@@ -1,6 +1,6 @@
-"""Harmonisation of the views of a folder, with one image file per finished view; by one process, several, or by Ray.
+"""Harmonisation of the views of a folder by one process, by several, or by Ray.
 
-A view is finished when its image exists, so a part can be started again after a kill or by another process.
+A view is finished when its image file exists, so that an interrupted part continues in any process.
 """
 
 import os
@@ -24,28 +24,28 @@ from splatgraft.runtime.progress import Progress, silent
 from splatgraft.runtime.workers import Task, run_tasks
 
 _READERS, _WRITERS = 1, 2
-"""Threads that decode and encode images beside the model: about 0.09 s a view of 704x496 in one thread."""
-_WAITING_VIEWS = 2  # finished views that may wait to be written
+"""Threads that decode and encode images beside the model; one thread takes about 0.09 s per view of 704x496."""
+_WAITING_VIEWS = 2  # maximum number of views that wait to be written
 _POLL_SECONDS = 0.5
 
 
 @dataclass(frozen=True)
 class Part:
-    """Every `of`-th view of a folder, from `number` on."""
+    """Share of a folder's views for one process: every `of`-th view, starting at `number`."""
 
     views: Path
-    """The folder of views."""
+    """Folder of views."""
     method: HarmonizerOptions
-    """The harmoniser's options."""
+    """Options of the harmoniser."""
     kept: Path
-    """Folder for finished images: images/ and confidence/."""
+    """Folder for finished images, with images/ and confidence/."""
     number: int = 0
     of: int = 1
     device: str = "auto"
-    """auto, cpu or cuda; or the device that was assigned to this part, such as cuda:1."""
+    """Device: auto, cpu, cuda, or the one assigned to this part, such as cuda:1."""
 
     def missing(self, views: ViewFolder) -> list[int]:
-        """Indices of the part's views that are not finished."""
+        """List the indices of the part's views that are not finished."""
         done = finished(self.kept, views)
         return [i for i in range(self.number, len(views), self.of) if i not in done]
 
@@ -57,12 +57,12 @@ def picture_folders(kept: Path) -> None:
 
 
 def finished(kept: Path, views: ViewFolder) -> set[int]:
-    """Indices of the views whose image exists."""
+    """Find the indices of the views whose image exists."""
     return {i for i, stem in enumerate(views.stems) if (kept / "images" / f"{stem}.png").is_file()}
 
 
 def harmonize_part(part: Part, say: Callable[[str], None] = lambda sentence: None, progress: Progress = silent) -> int:
-    """Harmonise the views of the part that are not finished; gives their number."""
+    """Harmonise the unfinished views of the part; returns their number."""
     views = ViewFolder.open(part.views)
     missing = part.missing(views)
     if not missing:
@@ -72,7 +72,7 @@ def harmonize_part(part: Part, say: Callable[[str], None] = lambda sentence: Non
     context = HarmonizerContext(device=device, views=len(missing), pixels=width * height, say=say)
     harmonizer = make_harmonizer(part.method, context)
     done = len(views) - len(missing) if part.of == 1 else 0
-    # files are decoded and encoded beside the model: it waits for the first view alone, and for writing at the end
+    # files are decoded and encoded beside the model, which waits only for the first view and the last write
     with ThreadPoolExecutor(_READERS) as readers, ThreadPoolExecutor(_WRITERS) as writers:
         ahead, written = readers.submit(views.read, missing[0]), deque[Future[None]]()
         for index, following in zip(missing, [*missing[1:], None], strict=True):
@@ -101,7 +101,8 @@ def harmonize_with_processes(whole: Part, processes: int, *, say: Callable[[str]
                 progress(len(finished(whole.kept, views)), len(views), f"{processes} processes")
             counts = [one.result() for one in running]
         except BrokenProcessPool as error:
-            raise ValueError(f"{whole.views}: expected processes that live, found one that was killed") from error
+            found = "found one that was killed; run the step again, or with fewer processes"
+            raise ValueError(f"{whole.views}: expected processes that finish, {found}") from error
         except BaseException:
             for process in active_children():
                 process.terminate()
@@ -111,7 +112,7 @@ def harmonize_with_processes(whole: Part, processes: int, *, say: Callable[[str]
 
 
 def harmonize_with_ray(whole: Part, parts: int, *, address: str, progress: Progress) -> None:
-    """Split the views into parts that Ray's workers harmonise, each with a GPU unless the device is cpu."""
+    """Split the views into parts for Ray's workers, each with a GPU unless the device is cpu."""
     split = [replace(whole, number=i, of=parts) for i in range(parts)]
     tasks = [Task(f"part {part.number}", partial(harmonize_part, part)) for part in split]
     gpus = 0 if whole.device == "cpu" else 1

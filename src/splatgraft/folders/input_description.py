@@ -1,4 +1,4 @@
-"""What is at a path that a user names, before a project is made of it: photos, a video, a posed capture or a scene."""
+"""Recognition of a user's input before a project is made of it: photos, a video, a posed capture or a scene."""
 
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -13,19 +13,19 @@ from splatgraft.formats.captures.photo_archive import count_archived_photos, is_
 from splatgraft.project.layout import PROJECT_FILE, SCENE_FILE
 
 InputKind = Literal["photos", "video", "posed capture", "scene", "project", "nothing"]
-_LARGE = 1 << 30  # bytes above which a scene is not read to count its Gaussians
+_LARGE = 1 << 30  # bytes above which a scene's Gaussians are not counted
 _FOLDERS = (f"target/scene/{SCENE_FILE}", f"result/{SCENE_FILE}", SCENE_FILE)
-"""Scenes in folders that splatgraft writes."""
+"""Scenes in folders of results."""
 
 
 @dataclass(frozen=True)
 class InputDescription:
-    """What is at a path."""
+    """The recognised kind of a path, with a line for the user."""
 
     kind: InputKind
-    """`nothing`: it is none of the others."""
+    """Kind of the input; `nothing` if it is none of the others."""
     text: str
-    """One line for the user: what it is, and what can be done with it."""
+    """Line for the user: what the input is and how it can be used."""
 
     @property
     def is_usable(self) -> bool:
@@ -34,7 +34,7 @@ class InputDescription:
 
 
 def require_input(path: Path) -> None:
-    """Raise where nothing is at a path that a user named, with the name beside it that was likely meant."""
+    """Raise ValueError if nothing is at a path, and name the most similar file in its folder."""
     if path.exists():
         return
     expected = f"{path}: expected photos, a video, a posed capture or a scene, found nothing there"
@@ -44,7 +44,7 @@ def require_input(path: Path) -> None:
 
 
 def describe_input(path: Path) -> InputDescription:
-    """Look at a path, which need not exist, without changing anything."""
+    """Recognise the input at a path, which need not exist; nothing is changed."""
     try:
         return _described(path)
     except (ValueError, OSError) as error:
@@ -59,16 +59,18 @@ def _described(path: Path) -> InputDescription:
     if is_scene(path):
         size = sum(p.stat().st_size for p in ([path] if path.is_file() else path.iterdir()) if p.is_file())
         count = "" if size > _LARGE else f" of {read_gaussians(path).count:,} Gaussians"
-        return InputDescription("scene", f"a trained scene{count}: images are rendered of it, nothing is trained")
+        return InputDescription("scene", f"a trained scene{count}: images are rendered from it, nothing is trained")
     if has_poses(path):
         posed = read_capture(path)
         masks = describe_masks(posed.image_paths, posed.mask_paths)
-        return InputDescription("posed capture", f"a capture of {len(posed)} images with poses, {masks}: it is trained")
+        return InputDescription(
+            "posed capture", f"a capture of {len(posed)} images with poses, {masks}: a scene is trained on it"
+        )
     if is_archive(path):
         return _photos(path, count_archived_photos(path), "unpacked first")
     if path.is_file():
         return InputDescription(
-            "video", f"{describe_video(path)}: frames are taken, poses are found, and it is trained"
+            "video", f"{describe_video(path)}: frames are taken, poses are found, and a scene is trained"
         )
     return _folder_of_photos(path)
 
@@ -84,4 +86,4 @@ def _folder_of_photos(path: Path) -> InputDescription:
 def _photos(path: Path, count: int, more: str) -> InputDescription:
     if count < MIN_VIEWS:
         raise ValueError(f"{path}: expected at least {MIN_VIEWS} photos, found {count}")
-    return InputDescription("photos", f"{count} photos, {more}: poses are found, and it is trained")
+    return InputDescription("photos", f"{count} photos, {more}: poses are found, and a scene is trained")

@@ -22,7 +22,7 @@ from splatgraft.segmentation import ObjectRegion
 MaskSource = Literal["auto", "files", "grabcut", "sam2", "birefnet", "box"]
 """Origin of the masks for `segment`."""
 
-_CELL_PX = 320  # longest side of one photograph on the sheet
+_CELL_PX = 320  # longest side of a photograph on the sheet
 _COLUMNS = 4
 _MASK_RED, _SELECTION_BLUE = (255, 60, 40), (60, 220, 255)
 

@@ -1,4 +1,4 @@
-"""Points that a user names by pixels of pictures: in prompts, as a place, as the ends of a known length."""
+"""Points that a user gives by pixels of pictures: prompts, a place, the ends of a known length."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
@@ -16,7 +16,7 @@ from splatgraft.rendering import surface_points
 
 
 def prompts_by_view(capture: PosedImages, prompts: Mapping[str, ViewPrompt], path: Path) -> dict[int, ViewPrompt]:
-    """The prompts of the file `path`, by picture's name, by index of their view in pixels of its undistorted camera."""
+    """Convert the prompts of the file `path` from pictures' names to views' indices and undistorted pixels."""
     found = {}
     for name, prompt in prompts.items():
         index = picture_called(capture.cameras.names, name, str(path))
@@ -25,7 +25,7 @@ def prompts_by_view(capture: PosedImages, prompts: Mapping[str, ViewPrompt], pat
 
 
 def picture_called(names: Sequence[str], name: str, where: str) -> int:
-    """The index of the one picture of that name, with or without folder and suffix; `where` has the name."""
+    """Find the picture of a name, with or without folder and suffix; `where` is the name's source, for messages."""
     paths, called = [PurePath(other) for other in names], PurePath(name)
     wanted = [i for i, other in enumerate(paths) if name in (str(other), other.name, other.stem)]
     wanted = wanted or [i for i, other in enumerate(paths) if called.stem == other.stem]
@@ -35,7 +35,7 @@ def picture_called(names: Sequence[str], name: str, where: str) -> int:
 
 
 def in_camera_pixels(capture: PosedImages, index: int, prompt: ViewPrompt) -> ViewPrompt:
-    """A prompt in pixels of the picture as a viewer shows it, in those of its undistorted camera."""
+    """Convert a prompt from pixels of the upright picture to those of its undistorted camera."""
     camera, path = capture.cameras[index], capture.image_paths[index]
     distortion = capture.distortions[index] if capture.distortions else None
     size = distortion.size if distortion is not None else (camera.width, camera.height)
@@ -56,14 +56,14 @@ def in_camera_pixels(capture: PosedImages, index: int, prompt: ViewPrompt) -> Vi
 
 
 def point_in_world(text: str, capture: PosedImages, scene: Gaussians | None, *, option: str) -> Float[Tensor, "3"]:
-    """The point that a user names.
+    """Compute the point in the world that a user gives.
 
     Args:
-        text: "X,Y,Z" in the world; "IMAGE:X,Y", a pixel of a picture, on the surface that it shows; or the same
-            point in several pictures, "IMAGE:X,Y IMAGE:X,Y", where the rays meet.
+        text: "X,Y,Z" in the world; "IMAGE:X,Y", a pixel whose surface point is meant; or "IMAGE:X,Y IMAGE:X,Y", one
+            point in several pictures, which is triangulated.
         capture: The pictures.
-        scene: Gives the surface of a single picture; None where there is none.
-        option: For messages.
+        scene: Scene whose surface a single picture shows; None if there is none.
+        option: Name of the option, for messages.
     """
     parts = text.split()
     if len(parts) == 1 and ":" not in text and len(numbers := _numbers(text)) == 3:

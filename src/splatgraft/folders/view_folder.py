@@ -1,7 +1,7 @@
 """A folder of rendered views: one file per picture and camera, as `render` writes and later steps read them.
 
 transforms.json  composite/NAME.png  background/  prior/  mask/  normal/NAME.png  depth/NAME.npy
-prior.json       confidence of the light behind prior/, 0 to 1, under the key "trust"
+prior.json       confidence of the light in prior/, 0 to 1, as "trust"
 """
 
 import json
@@ -26,7 +26,7 @@ PICTURES = ("composite", "background", "prior", "mask", "normal", "depth")
 
 
 def file_stems(cameras: Cameras) -> tuple[str, ...]:
-    """A file name without suffix for each camera, made of the camera's name and its last folder."""
+    """Make a file name without suffix for each camera, of the camera's name and its last folder."""
     stems = tuple("_".join(PurePosixPath(name).with_suffix("").parts[-2:]) for name in cameras.names)
     stems = tuple(stem.removeprefix("images_") for stem in stems)
     if len(set(stems)) < len(stems):
@@ -37,18 +37,18 @@ def file_stems(cameras: Cameras) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class ViewFolder:
-    """The pictures of a composite from all its cameras, read one view at a time."""
+    """Pictures of a composite from all its cameras, read one view at a time."""
 
     folder: Path
     """Folder of the pictures."""
     cameras: Cameras
-    """One per view."""
+    """Camera of each view."""
     stems: tuple[str, ...]
     """File names of the views, without suffix."""
 
     @staticmethod
     def create(folder: Path, cameras: Cameras, *, prior_confidence: float = 0.0) -> "ViewFolder":
-        """Make an empty folder of views for `cameras`; `prior_confidence`, in [0, 1], is that of the priors' light."""
+        """Make an empty folder of views for `cameras`; `prior_confidence`, in [0, 1], is of the priors' light."""
         for name in PICTURES:
             (folder / name).mkdir(parents=True, exist_ok=True)
         write_cameras(folder / CAMERAS_FILE, cameras)
@@ -65,11 +65,11 @@ class ViewFolder:
         return len(self.stems)
 
     def path(self, picture: str, index: int) -> Path:
-        """The file of one picture of one view."""
+        """Return the file of one picture of one view."""
         return self.folder / picture / f"{self.stems[index]}{'.npy' if picture == 'depth' else '.png'}"
 
     def files(self) -> tuple[Path, ...]:
-        """All files of the folder."""
+        """List all files of the folder."""
         pictures = [self.path(name, i) for name in PICTURES for i in range(len(self))]
         return (self.folder / CAMERAS_FILE, *pictures, self.folder / _PRIOR_FILE)
 
@@ -82,7 +82,7 @@ class ViewFolder:
             np.save(stream, view.depth.cpu().numpy().astype(np.float32))
 
     def read(self, index: int) -> HarmonizerInputs:
-        """All pictures of one view."""
+        """Read all pictures of one view."""
         composite, background, prior = (read_rgb(self.path(name, index)) for name in PICTURES[:3])
         depth = _read_depth(self.path("depth", index))
         normal = _normal_from_rgb(read_rgb(self.path("normal", index)))
@@ -104,16 +104,16 @@ class ViewFolder:
         )
 
     def _prior_confidence(self) -> float:
-        """Confidence of the priors' light."""
+        """Read the confidence of the priors' light."""
         path = self.folder / _PRIOR_FILE
         return number(path, load(path), "trust")
 
 
 def _normal_from_rgb(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Unit normals of 8-bit pictures; grey, which means no surface, becomes zero."""
+    """Decode unit normals of 8-bit pictures; grey, which means no surface, becomes zero."""
     normal = image * 2 - 1
     length = normal.norm(dim=-1, keepdim=True)
-    # grey is off zero by half a level per channel, a normal by less than that from length 1
+    # rounding moves grey from 0, and a normal from length 1, by at most half a level per channel
     return torch.where(length > 0.5, normal / length.clamp_min(0.5), 0.0)
 
 

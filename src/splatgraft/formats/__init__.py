@@ -1,15 +1,16 @@
-"""Reads and writes scenes, captures and cameras, in the format given by the suffix or by the files in a folder."""
+"""Reading and writing of scenes, captures and cameras; the suffix, or the files in a folder, give the format."""
 
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
+from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures import read_capture_file
 from splatgraft.formats.captures.transforms_json import write_cameras, write_capture
 from splatgraft.formats.captures.views import ViewRecord, cameras, posed_images
+from splatgraft.formats.parsing import parsing
 from splatgraft.formats.scenes.axes import with_axes
 from splatgraft.formats.scenes.compressed_ply import COMPRESSED_PLY, write_compressed_ply
 from splatgraft.formats.scenes.gaussian_glb import read_gaussian_glb, write_gaussian_glb
@@ -60,81 +61,79 @@ _WRITERS = {
     ".glb": write_gaussian_glb,
 }
 
+_COEFFICIENTS = tuple(spherical_harmonics.coefficient_count(d) for d in range(spherical_harmonics.MAX_DEGREE + 1))
+
 SCENE_SUFFIXES = tuple(_READERS)
-"""Suffixes of trained scenes that can be read; a folder of SOG pictures has none."""
+"""Suffixes of trained scenes that can be read; a folder of SOG images has none."""
 
 WRITTEN_SCENE_SUFFIXES = tuple(_WRITERS)
 """Suffixes of scenes that can be written."""
 
 
 def is_scene(path: Path) -> bool:
-    """Whether the suffix is that of a trained scene, or it is a folder of SOG pictures or the meta.json of one."""
+    """Whether the suffix is that of a trained scene, or the path is a folder of SOG images or its meta.json."""
     return path.suffix.lower() in _READERS or is_sog_folder(path)
 
 
 def scene_files(path: Path) -> tuple[Path, ...]:
-    """The files of a trained scene: itself, or the files of a folder of SOG pictures."""
+    """List the files of a trained scene: the file itself, or those of a folder of SOG images."""
     return sog_files(path) if is_sog_folder(path) else (path,)
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
-    """Read a trained scene, taking the word of the file's layout.
+    """Read a trained scene.
 
     Args:
         path: A .ply (of 3DGS, or SuperSplat's compressed form), .spz, .splat, .sog, .glb or .ksplat file, or a folder
-            of SOG pictures.
+            of SOG images.
 
     Returns:
-        Its Gaussians, in the file's order, and in the axes of a .ply where the format has others.
+        The Gaussians in the file's order; the axes of other formats are turned to those of a .ply.
 
     Raises:
-        ValueError: The suffix is another, or the file is not what its suffix says.
+        ValueError: The suffix is not supported, or the file does not match its suffix.
     """
     return _read(Path(path)).gaussians
 
 
 def read_scene(path: Path | str, *, axes: str | None = None) -> SceneFile:
-    """Read a trained scene of another program, with what is known of its frame.
+    """Read a trained scene of another program, with the up direction and size that the file states.
 
-    `axes` are the directions of the file's x, y and z, such as RDF or RUB, where those of the format are wrong.
+    `axes` are the directions of the file's x, y and z, such as RDF or RUB, if they differ from the format's.
     """
     scene = _read(Path(path))
     return scene if axes is None else with_axes(scene, axes)
 
 
 def _read(path: Path) -> SceneFile:
-    with _readable(path):
+    with parsing(path):
         read = read_sog if is_sog_folder(path) else _by_suffix(path, _READERS)
         if not path.exists():
-            raise ValueError(f"{path}: expected a trained scene, found none")
-        try:
-            return read(path)
-        except OSError:
-            raise
-        except Exception as error:  # a damaged file makes its parser raise any kind of error
-            if isinstance(error, ValueError) and str(path) in str(error):
-                raise
-            found = " ".join(f"{type(error).__name__}: {error}".split())[:160]
-            raise ValueError(f"{path}: expected a whole {path.suffix} scene, found {found}") from error
+            raise ValueError("expected a trained scene, found none")
+        scene = read(path)
+        shapes = [tuple(field.shape) for field in vars(scene.gaussians).values()]
+        if len({shape[0] for shape in shapes}) > 1 or shapes[-1][1] not in _COEFFICIENTS:
+            raise ValueError(f"expected fields of one length, and 1, 4, 9 or 16 SH coefficients, found {shapes}")
+    return scene
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians, *, metadata: SceneMetadata = SceneMetadata()) -> None:
-    """Write a scene in the format of the suffix; the file appears whole or not at all.
+    """Write a scene in the format of its suffix, atomically.
 
     Args:
         path: A file that ends in .ply (exact), .glb (float32), .sog, .spz, .compressed.ply or .splat
             (quantised; .sog and .compressed.ply change the order, .splat keeps band 0 of the colour only).
         gaussians: The scene, on the CPU.
-        metadata: What is known of its frame; left out of .spz and .splat, which have no room for it.
+        metadata: Up direction and size of the scene; .spz and .splat cannot store them.
 
     Raises:
-        ValueError: The suffix is another, or the format cannot hold the scene.
+        ValueError: The suffix is not supported, or the format cannot hold the scene.
     """
     _by_suffix(Path(path), _WRITERS)(Path(path), gaussians, metadata)
 
 
 def scene_suffix(path: Path) -> str:
-    """The suffix that names the format of a scene to write: the last one, or .compressed.ply."""
+    """Return the suffix that names the format of a scene to write: the last one, or .compressed.ply."""
     return COMPRESSED_PLY if path.name.lower().endswith(COMPRESSED_PLY) else path.suffix.lower()
 
 
@@ -146,26 +145,25 @@ def _by_suffix(path: Path, functions: dict[str, Callable]) -> Callable:
 
 
 def read_capture(path: Path | str) -> PosedImages:
-    """Read a capture: posed images, sparse points, and object masks where there are some.
+    """Read a capture: posed images, sparse points, and object masks if there are any.
 
     Args:
         path: A folder with transforms.json (or Blender's transforms_train.json), that file itself, or a COLMAP folder;
-            of a folder with both, transforms.json is read. Masks are found by file name in masks/, or in the alpha
-            channel of the images.
+            transforms.json is preferred. Masks are found by file name in masks/, or in the alpha channel of the images.
 
     Returns:
-        The capture; image files are read when asked for.
+        The capture; image files are read on access.
 
     Raises:
-        ValueError: There is none of these at `path`, or a file is broken.
+        ValueError: There is no capture at `path`, or a file is broken.
     """
-    with _readable(Path(path)):
+    with parsing(Path(path)):
         return posed_images(read_capture_file(Path(path)))
 
 
 def read_images(path: Path) -> PosedImages:
-    """Posed photographs without points, as of a ground truth; a points file need not exist."""
-    with _readable(path):
+    """Read posed photographs without points, for example a ground truth; a points file need not exist."""
+    with parsing(path):
         return posed_images(read_capture_file(path), with_points=False)
 
 
@@ -179,23 +177,14 @@ def read_cameras(path: Path | str) -> Cameras:
         Undistorted pinhole cameras, in the file's order and frame.
 
     Raises:
-        ValueError: There is none of these at `path`, or a file is broken.
+        ValueError: There are no cameras at `path`, or a file is broken.
     """
-    with _readable(Path(path)):
+    with parsing(Path(path)):
         return cameras(read_capture_file(Path(path)))
 
 
 def list_capture_images(path: Path) -> list[Path]:
-    """The image files of a capture that exist; none for a cameras.json."""
-    with _readable(path):
+    """List the existing image files of a capture; none for a cameras.json."""
+    with parsing(path):
         views = read_capture_file(path).views
     return [view.image_path for view in views if isinstance(view, ViewRecord) and view.image_path]
-
-
-@contextmanager
-def _readable(path: Path) -> Generator[None]:
-    """Turns the system's errors (permissions, impossible names) into a ValueError that names the file."""
-    try:
-        yield
-    except OSError as error:
-        raise ValueError(f"{error.filename or path}: expected a readable file, found {error.strerror}") from error

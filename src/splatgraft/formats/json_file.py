@@ -1,6 +1,6 @@
-"""JSON files: written whole, and checked access to their values: numbers, image sides, file names and arrays.
+"""JSON files, written atomically, and checked access to their numbers, image sides, file names and arrays.
 
-What is not as expected raises a ValueError that begins with `where`, the file or a place in it.
+A value of another kind raises a ValueError that begins with `where`, the file or a place in it.
 """
 
 import json
@@ -16,7 +16,7 @@ _LONGEST = 60  # characters of a value in an error message
 
 
 def load(path: Path) -> Any:
-    """The file's content."""
+    """Read a JSON file."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a JSON file, found none")
     try:
@@ -32,7 +32,7 @@ def save(path: Path, content: Any) -> None:
 
 
 def number(where: Path | str, entry: dict[str, Any], key: str, default: float | None = None) -> float:
-    """A finite number below 1e9."""
+    """Return a finite number below 1e9."""
     value = entry.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:
         raise ValueError(f"{where}: expected a finite number for '{key}', found {excerpt(value)}")
@@ -40,7 +40,7 @@ def number(where: Path | str, entry: dict[str, Any], key: str, default: float | 
 
 
 def whole_side(where: Path | str, entry: dict[str, Any], key: str) -> int:
-    """An image side, pixels."""
+    """Return an image side, pixels."""
     value = number(where, entry, key)
     if not (value.is_integer() and 1 <= value <= MAX_SIDE):
         raise ValueError(f"{where}: expected a whole number from 1 to {MAX_SIDE} for '{key}', found {value:g}")
@@ -48,7 +48,7 @@ def whole_side(where: Path | str, entry: dict[str, Any], key: str) -> int:
 
 
 def text(where: Path | str, entry: dict[str, Any], key: str) -> str:
-    """A file name, with forward slashes."""
+    """Return a file name, with forward slashes."""
     value = entry.get(key)
     if not isinstance(value, str) or not value.strip("./\\ ") or not value.isprintable() or len(value) > 1024:
         raise ValueError(f"{where}: expected a file name for '{key}', found {excerpt(value)}")
@@ -56,7 +56,7 @@ def text(where: Path | str, entry: dict[str, Any], key: str) -> str:
 
 
 def array(where: Path | str, entry: dict[str, Any], key: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
-    """Numbers in one of `shapes`, float64; they may be nan."""
+    """Return numbers in one of `shapes`, float64; they may be nan."""
     value = entry.get(key)
     try:
         out = np.array(value, np.float64)
@@ -68,5 +68,5 @@ def array(where: Path | str, entry: dict[str, Any], key: str, shapes: tuple[tupl
 
 
 def excerpt(value: Any) -> str:
-    """The start of a value as text on one line."""
+    """Write the start of a value as text on one line."""
     return repr(value)[:_LONGEST] if not isinstance(value, int) or abs(value) < 1e30 else "a huge number"

@@ -1,4 +1,4 @@
-"""Files with one value per Gaussian of a scene: what is selected or erased, and what a user corrects by hand.
+"""Files with one value per Gaussian of a scene: selected, erased, or corrected by a user.
 
 Selections (`selection.npy`, `is_object.npy`, `erased.npy`) have one bool per Gaussian. `corrections.npy` has one int8
 per Gaussian of the source scene: 1 added, -1 removed, 0 as selected by the masks.
@@ -15,12 +15,12 @@ from splatgraft.runtime.files import atomic_write
 
 
 def read_flags(path: Path) -> Bool[Tensor, "n"]:
-    """The flags in `path`."""
+    """Read the flags in `path`."""
     return torch.from_numpy(_read(path, np.dtype(np.bool_)))
 
 
 def read_selection(path: Path, count: int, scene: Path) -> Bool[Tensor, "n"]:
-    """The flags in `path`, one for each of the `count` Gaussians of `scene`."""
+    """Read the flags in `path`, one for each of the `count` Gaussians of `scene`."""
     flags = read_flags(path)
     if len(flags) != count:
         raise ValueError(f"{path}: expected one flag for each of the {count} Gaussians of {scene}, found {len(flags)}")
@@ -28,7 +28,7 @@ def read_selection(path: Path, count: int, scene: Path) -> Bool[Tensor, "n"]:
 
 
 def read_corrections(path: Path) -> Int8[Tensor, "n"]:
-    """The corrections in `path`."""
+    """Read the corrections in `path`."""
     corrections = _read(path, np.dtype(np.int8))
     if (abs(corrections) > 1).any():
         raise ValueError(f"{path}: expected one int8 of -1, 0 or 1 per Gaussian, found {int(corrections.max())}")

@@ -1,8 +1,8 @@
-"""scale.json: metres per world unit of a capture, and where the number is from.
+"""scale.json: metres per world unit of a capture, and the source of the number.
 
     {"metres_per_unit": 0.21, "source": "a length of 0.3 m between two points"}
 
-It lies in the capture's folder; of a capture that a step made, beside it, so that doing the step again keeps it.
+It lies in the capture's folder. If a step made the capture, it lies beside the folder, so that a new run keeps it.
 """
 
 from dataclasses import asdict, dataclass
@@ -18,19 +18,19 @@ class MetricScale:
     """The size of a capture's world unit."""
 
     metres_per_unit: float
-    """Above 0."""
+    """Metres per world unit, above 0."""
     source: str
-    """Where the number is from, for messages."""
+    """Source of the number, for messages."""
 
 
 def scale_path(capture: Path) -> Path:
-    """Where the scale of a capture is stored: a folder, or a file in it such as transforms.json."""
+    """Return the path of a capture's scale; `capture` is its folder, or a file in it such as transforms.json."""
     folder = capture if capture.is_dir() else capture.parent
     return (folder.parent if (folder / "step.json").is_file() else folder) / SCALE_FILE
 
 
 def read_scale(capture: Path) -> MetricScale | None:
-    """The scale of a capture; None where it has none."""
+    """Read the scale of a capture; None if it has none."""
     path = scale_path(capture)
     if not path.is_file():
         return None
@@ -44,7 +44,7 @@ def read_scale(capture: Path) -> MetricScale | None:
 
 
 def write_scale(capture: Path, scale: MetricScale) -> Path:
-    """Store the scale of a capture; gives the file."""
+    """Write the scale of a capture; returns the file."""
     path = scale_path(capture)
     save(path, asdict(scale))
     return path

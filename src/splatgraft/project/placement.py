@@ -3,8 +3,8 @@
     {"objects": [{"object": "object.ply", "scale": 1.0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}],
      "erased": "erased.npy"}
 
-`rotation` is a wxyz quaternion or a 3x3 matrix of rows; `object` and `erased` may be missing and are relative to the
-file; x_in_target = scale * rotation @ x_in_object + translation. erased.npy: one bool per Gaussian of the target.
+`rotation` is a wxyz quaternion or a 3x3 matrix of rows. `object` and `erased` are optional paths, relative to the file.
+x_in_target = scale * rotation @ x_in_object + translation. erased.npy has one bool per Gaussian of the target.
 """
 
 import os
@@ -32,9 +32,9 @@ class ObjectPlacement:
     """The placement of one object."""
 
     target_from_object: Similarity
-    """From the object's capture to the target's."""
+    """Transform from the object's capture to the target's."""
     object_path: Path | None = None
-    """File of the object's Gaussians; None where the placement names none."""
+    """File of the object's Gaussians; None if the placement names none."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Placement:
     """The content of a placement.json."""
 
     objects: tuple[ObjectPlacement, ...]
-    """In the order in which they are baked into the composite; may be empty."""
+    """Objects in the order in which they are baked into the composite; may be empty."""
     erased: Bool[Tensor, "n"] | None = None
-    """True where a Gaussian of the target is left out; None where none is."""
+    """Mask of the target's Gaussians that are left out; None if none is."""
 
 
 def read_placement(path: Path) -> Placement:
@@ -61,7 +61,7 @@ def read_placement(path: Path) -> Placement:
 
 
 def write_placement(path: Path, placement: Placement) -> None:
-    """Write placement.json, and erased.npy beside it where anything is erased; both are read back exactly."""
+    """Write placement.json, and erased.npy beside it if anything is erased; reading restores both exactly."""
     entries = []
     for item in placement.objects:
         named = {} if item.object_path is None else {"object": os.path.relpath(item.object_path, path.parent)}

@@ -1,11 +1,11 @@
-"""Files of prompts: what a user says about the object in single pictures, as TOML or JSON.
+"""Files of prompts, as TOML or JSON: points and rectangles by which a user marks the object in single pictures.
 
     ["DSC_0423.jpg"]
     inside = [[412, 300], [380, 351]]   # on the object: x to the right, y down, pixels as a viewer shows the file
     outside = [[100, 500]]              # points beside it
     box = [300, 200, 520, 480]          # left, top, right, bottom of a rectangle that holds the whole object
 
-Keys are names of pictures, with or without folder and suffix. The same as JSON: {"DSC_0423": {"inside": [[412, 300]]}}.
+Keys are names of pictures, with or without folder and suffix. In JSON: {"DSC_0423": {"inside": [[412, 300]]}}.
 """
 
 from collections.abc import Mapping
@@ -25,25 +25,25 @@ _KEYS = ("inside", "outside", "box")
 
 
 def read_prompts(path: Path) -> dict[str, ViewPrompt]:
-    """The prompts of a file, by the name of the picture."""
+    """Read the prompts of a file, by the name of the picture."""
     return prompts_from_json(load(path) if path.suffix.lower() == ".json" else read_toml(path), str(path))
 
 
 def prompts_from_json(content: Any, where: str) -> dict[str, ViewPrompt]:
-    """The prompts of a file's tables, lists and numbers, by the name of the picture; `where` is for messages."""
+    """Convert a file's content to prompts, by the name of the picture; `where` is for messages."""
     if not isinstance(content, dict) or not content:
         raise ValueError(f"{where}: expected a table of points per picture, found {excerpt(content)}")
     return {name: _prompt(where, name, entry) for name, entry in content.items()}
 
 
 def write_prompts(path: Path, prompts: Mapping[str, ViewPrompt]) -> None:
-    """Write prompts as JSON, so that `read_prompts` gives the same back."""
+    """Write prompts as JSON; `read_prompts` restores them exactly."""
     assert path.suffix.lower() == ".json", path
     save(path, prompts_to_json(prompts))
 
 
 def prompts_to_json(prompts: Mapping[str, ViewPrompt]) -> dict[str, Any]:
-    """Tables, lists and numbers from which `prompts_from_json` gives the same back."""
+    """Convert prompts to JSON's types; `prompts_from_json` restores them exactly."""
     content = {}
     for name, prompt in prompts.items():
         points = {"inside": _decimal(prompt.inside), "outside": _decimal(prompt.outside)}
@@ -53,7 +53,7 @@ def prompts_to_json(prompts: Mapping[str, ViewPrompt]) -> dict[str, Any]:
 
 
 def _decimal(points: Float[Tensor, "k 2"]) -> list[list[float]]:
-    """The shortest decimal numbers that are read back as the same float32."""
+    """Convert to the shortest decimal numbers that are read back as the same float32."""
     return [[float(str(number)) for number in point] for point in points.numpy().astype(np.float32)]
 
 

@@ -1,4 +1,4 @@
-"""Captures: where the poses of one lie, their reading, and their joining to photos that lie somewhere else."""
+"""Captures: finding and reading their poses, and joining the poses to photos in another folder."""
 
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
@@ -9,11 +9,11 @@ from splatgraft.formats.captures.masks import PhotoFiles
 from splatgraft.formats.captures.transforms_json import read_json
 from splatgraft.formats.captures.views import CaptureFile, fitted_to_file, posed_images
 
-_MIN_PHOTOS = 3  # photos with a pose: below it nothing is seen from two sides and checked by a third
+_MIN_PHOTOS = 3  # with a pose: two triangulate a point, and a third checks it
 
 
 def find_poses(path: Path) -> Path | None:
-    """The JSON file with the poses of a capture (a folder or that file), or its COLMAP folder; None without poses."""
+    """Find the JSON file with the poses of a capture, or its COLMAP folder; `path` may be that file."""
     if path.suffix.lower() == ".json":
         return path
     for name in ("transforms.json", "transforms_train.json"):
@@ -23,7 +23,7 @@ def find_poses(path: Path) -> Path | None:
 
 
 def read_capture_file(path: Path) -> CaptureFile:
-    """The capture in a folder, or that a file describes; of a folder with both, transforms.json and not COLMAP's."""
+    """Read a capture from a folder or its JSON file; transforms.json is preferred to COLMAP's files."""
     if not path.exists():
         raise ValueError(f"{path}: expected a capture folder or a transforms.json, found nothing there")
     found = path if path.is_file() else find_poses(path)
@@ -36,13 +36,13 @@ def read_capture_file(path: Path) -> CaptureFile:
 
 
 def read_given_poses(source: Path, photos: PhotoFiles) -> tuple[PosedImages, list[str], list[str]]:
-    """The `photos` with the poses in `source`, and the names of photos without a pose and of poses without a photo.
+    """Join photos with given poses; returns the names of photos without a pose and of poses without a photo as well.
 
-    A pose belongs to the photo with its name, whatever its suffix.
+    A pose belongs to the photo with its name; suffixes may differ.
 
     Args:
-        source: A folder with a COLMAP model or a transforms.json, or a file of these.
-        photos: With their masks.
+        source: A folder with a COLMAP model or a transforms.json, or one of their files.
+        photos: Photos and their masks.
     """
     found = find_poses(source) or find_poses(source.parent if source.is_file() else source)
     if found is None:
@@ -72,6 +72,6 @@ def read_given_poses(source: Path, photos: PhotoFiles) -> tuple[PosedImages, lis
 
 
 def _stem(name: str, known: dict[str, str]) -> str:
-    """The stem of the photo that a pose is for; Blender's paths may lack the suffix."""
+    """Return the stem of the photo that a pose names; Blender's paths may lack the suffix."""
     last = PureWindowsPath(name).name
     return known.get(last) or (last if last in known.values() else PureWindowsPath(last).stem)

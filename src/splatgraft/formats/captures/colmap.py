@@ -1,11 +1,10 @@
-"""Reads COLMAP reconstructions, text and binary: cameras, images and points3D, in the folders that COLMAP uses.
+"""COLMAP reconstructions, text and binary: cameras, images and points3D, in the folders that COLMAP uses.
 
-Of several models the one with the most registered images is read.
+If there are several models, the one with the most registered images is read.
 """
 
 import struct
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -17,12 +16,13 @@ from torch import Tensor
 
 from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.formats.captures.views import MAX_SIDE, CaptureFile, ViewRecord, existing_file, rigid
+from splatgraft.formats.parsing import parsing
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
 )
-"""By number in binary files; those with a number of parameters below are read."""
+"""Camera models by their number in binary files; those with a parameter count below are read."""
 _PARAMETER_COUNTS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
 _MODEL_FOLDERS = ("sparse/*", "sparse", ".", "colmap/sparse/*", "colmap/sparse")
 
@@ -40,7 +40,7 @@ class _Image(NamedTuple):
     name: str
     camera_id: int
     pose: Sequence[float]
-    """Quaternion wxyz and translation, camera from world."""
+    """Quaternion wxyz and translation, camera_from_world."""
 
 
 def is_colmap(folder: Path) -> bool:
@@ -65,10 +65,8 @@ def _file(model: Path, stem: str) -> Path:
 
 
 def read_colmap(folder: Path) -> CaptureFile:
-    """The largest model, ordered by image name."""
+    """Read the largest model of a folder that has one, its views ordered by image name."""
     models = [(path, _read_images(_file(path, "images"))) for path in _model_folders(folder)]
-    if not models:
-        raise ValueError(f"{folder}: expected a COLMAP model (cameras, images, points3D as .bin or .txt), found none")
     model, images = max(models, key=lambda model: len(model[1]))  # the first of equals
     source, cameras = _file(model, "images"), _read_cameras(_file(model, "cameras"))
     if not images:
@@ -98,16 +96,16 @@ def _pose(image: _Image, source: Path) -> np.ndarray:
     return rigid(pose, f"{source}: {image.name}")
 
 
-def _camera(path: Path, model: str, size: tuple[int, int], numbers: tuple[float, ...]) -> _Camera:
+def _camera(model: str, size: tuple[int, int], numbers: tuple[float, ...]) -> _Camera:
     if model not in _PARAMETER_COUNTS:
         raise ValueError(
-            f"{path}: expected camera model {', '.join(_PARAMETER_COUNTS)}, found {model[:40]}; "
+            f"expected camera model {', '.join(_PARAMETER_COUNTS)}, found {model[:40]}; "
             "undistort the images with 'colmap image_undistorter' first"
         )
     if len(numbers) != _PARAMETER_COUNTS[model]:
-        raise ValueError(f"{path}: expected {_PARAMETER_COUNTS[model]} numbers for {model}, found {len(numbers)}")
+        raise ValueError(f"expected {_PARAMETER_COUNTS[model]} numbers for {model}, found {len(numbers)}")
     if not 1 <= min(size) <= max(size) <= MAX_SIDE:
-        raise ValueError(f"{path}: expected image sides from 1 to {MAX_SIDE} px, found {size[0]} and {size[1]}")
+        raise ValueError(f"expected image sides from 1 to {MAX_SIDE} px, found {size[0]} and {size[1]}")
     if model in ("PINHOLE", "OPENCV"):
         focal, center, rest = numbers[:2], numbers[2:4], numbers[4:]
     else:
@@ -117,88 +115,76 @@ def _camera(path: Path, model: str, size: tuple[int, int], numbers: tuple[float,
 
 def _read_cameras(path: Path) -> dict[int, _Camera]:
     cameras = {}
-    if path.suffix == ".txt":
-        for line in _lines(path):
-            with _fields(path, "ID MODEL WIDTH HEIGHT PARAMETERS", line):
+    with parsing(path):
+        if path.suffix == ".txt":
+            for line in _lines(path):
                 camera_id, model, width, height, *numbers = line.split()
-                values = int(camera_id), (int(width), int(height)), tuple(map(float, numbers))
-            cameras[values[0]] = _camera(path, model, *values[1:])
-        return cameras
-    with _records(path) as records:
+                cameras[int(camera_id)] = _camera(model, (int(width), int(height)), tuple(map(float, numbers)))
+            return cameras
+        records = _Records(path.read_bytes())
         for _ in range(records.take("<Q")[0]):
             camera_id, number, width, height = records.take("<IiQQ")
             model = _MODELS[number] if 0 <= number < len(_MODELS) else f"number {number}"
             numbers = records.take(f"<{_PARAMETER_COUNTS.get(model, 0)}d")
-            cameras[camera_id] = _camera(path, model, (width, height), numbers)
-    return cameras
+            cameras[camera_id] = _camera(model, (width, height), numbers)
+        records.end()
+        return cameras
 
 
 def _read_images(path: Path) -> list[_Image]:
     images = []
-    if path.suffix == ".txt":
-        lines = iter(_lines(path, every=True))
-        for line in lines:
-            if not line or line.startswith("#"):
-                continue
-            with _fields(path, "ID QW QX QY QZ TX TY TZ CAMERA NAME", line):
+    with parsing(path):
+        if path.suffix == ".txt":
+            lines = iter(_lines(path, every=True))
+            for line in lines:
+                if not line or line.startswith("#"):
+                    continue
                 _, qw, qx, qy, qz, tx, ty, tz, camera_id, name = line.split(None, 9)
                 pose = [float(number) for number in (qw, qx, qy, qz, tx, ty, tz)]
                 images.append(_Image(name, int(camera_id), pose))
-            next(lines, None)  # observations, which may be none
-        return images
-    with _records(path) as records:
+                next(lines, None)  # observations, which may be none
+            return images
+        records = _Records(path.read_bytes())
         for _ in range(records.take("<Q")[0]):
             _, *pose, camera_id = records.take("<I7dI")
             name = records.take_name()
             records.skip(records.take("<Q")[0] * 24)  # observations
             images.append(_Image(name, camera_id, pose))
-    return images
+        records.end()
+        return images
 
 
 def _read_points(path: Path) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     found = []
-    if path.suffix == ".txt":
-        for line in _lines(path):
-            with _fields(path, "ID X Y Z R G B ERROR TRACK", line):
+    with parsing(path):
+        if path.suffix == ".txt":
+            for line in _lines(path):
                 x, y, z, *color = line.split(None, 8)[1:7]
-                rgb = [int(word) for word in color]
-                if len(rgb) != 3 or min(rgb) < 0 or max(rgb) > 255:
-                    raise ValueError
-                found.append([float(x), float(y), float(z), *rgb])
-    else:
-        with _records(path) as records:
+                red, green, blue = bytes(map(int, color))  # refuses numbers above 255
+                found.append([float(x), float(y), float(z), red, green, blue])
+        else:
+            records = _Records(path.read_bytes())
             for _ in range(records.take("<Q")[0]):
                 _, *point, _, track = records.take("<Q3d3BdQ")
                 found.append(point)
                 records.skip(track * 8)
-    table = np.array(found, np.float64).reshape(-1, 6)
-    positions, colors = table[:, :3], table[:, 3:].astype(np.uint8)
-    if not np.isfinite(positions).all() or np.abs(positions).max(initial=0) > 1e30:
-        raise ValueError(f"{path}: expected finite points, found nan, infinity or more than 1e30")
-    return torch.from_numpy(positions).float(), torch.from_numpy(colors).float() / 255
+            records.end()
+        table = np.array(found, np.float64).reshape(-1, 6)
+        positions, colors = table[:, :3], table[:, 3:].astype(np.uint8)
+        if not np.isfinite(positions).all() or np.abs(positions).max(initial=0) > 1e30:
+            raise ValueError("expected finite points, found nan, infinity or more than 1e30")
+        return torch.from_numpy(positions).float(), torch.from_numpy(colors).float() / 255
 
 
 def _lines(path: Path, *, every: bool = False) -> list[str]:
-    """The lines of a text file, without empty ones and comments unless `every` line counts."""
-    try:
-        lines = [line.strip() for line in path.read_text("utf-8").splitlines()]
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: expected UTF-8 text, found {error.reason} at byte {error.start}") from None
+    """Read the lines of a text file, without empty ones and comments unless `every` line counts."""
+    lines = [line.strip() for line in path.read_text("utf-8").splitlines()]
     return [line for line in lines if every or (line and not line.startswith("#"))]
-
-
-@contextmanager
-def _fields(path: Path, names: str, line: str) -> Iterator[None]:
-    """Turns what fails when `line` is parsed into a ValueError that names the file and the fields."""
-    try:
-        yield
-    except (ValueError, OverflowError):
-        raise ValueError(f"{path}: expected '{names}', found {line[:60]!r}") from None
 
 
 @dataclass
 class _Records:
-    """A binary file that is read from front to back."""
+    """A binary file that is read from front to back; its counts are not trusted."""
 
     data: bytes
     at: int = 0
@@ -212,21 +198,11 @@ class _Records:
         self.at += size
 
     def take_name(self) -> str:
-        end = self.data.find(b"\0", self.at)
-        if end <= self.at:
-            raise struct.error("no image name")
+        end = self.data.index(b"\0", self.at)
         name = self.data[self.at : end].decode("utf-8")
         self.at = end + 1
         return name
 
-
-@contextmanager
-def _records(path: Path) -> Iterator[_Records]:
-    """The records of a file, which must be read to its end; counts in it are not trusted."""
-    records = _Records(path.read_bytes())
-    try:
-        yield records
-    except (struct.error, UnicodeDecodeError, OverflowError) as error:
-        raise ValueError(f"{path}: expected whole records at byte {records.at}, found {error}") from None
-    if records.at != len(records.data):
-        raise ValueError(f"{path}: expected the end after {records.at} bytes, found {len(records.data)}")
+    def end(self) -> None:
+        if self.at != len(self.data):
+            raise ValueError(f"expected the end after {self.at} bytes, found {len(self.data)}")

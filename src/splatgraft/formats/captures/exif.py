@@ -1,4 +1,4 @@
-"""Exposure metadata of photographs: from EXIF tags to `Exposure`, and back to the tags of a written image."""
+"""Exposure metadata of photographs: EXIF tags to `Exposure`, and back for a written image."""
 
 import math
 from collections.abc import Sequence
@@ -15,11 +15,11 @@ from splatgraft.core.images import read_exif
 _MAX_ISO = 65535  # the tag has 16 bits
 _AUTO, _MANUAL = 0, 1
 """Values of the tag WhiteBalance."""
-_MAX_STOPS = 40.0  # largest APEX value; cameras write some 100 stops where they know nothing
+_MAX_STOPS = 40.0  # largest APEX value; cameras write about 100 for unknown ones
 
 
 def read_exposure(path: Path) -> Exposure:
-    """Read the exposure metadata of a photo; tags that are missing, zero or no finite numbers count as not known."""
+    """Read the exposure metadata of a photo; tags that are missing, zero or not finite count as unknown."""
     numbers = {tag: _number(value) for tag, value in read_exif(path).items()}
     positive = {tag: number for tag, number in numbers.items() if number is not None and number > 0}
     stops = {tag: number for tag, number in numbers.items() if number is not None and abs(number) <= _MAX_STOPS}
@@ -35,7 +35,7 @@ def read_exposure(path: Path) -> Exposure:
 
 
 def exif_of(exposure: Exposure) -> Image.Exif:
-    """The EXIF with the known settings and nothing else, for Pillow's `save` of a JPEG."""
+    """Make EXIF of the known settings alone, for Pillow's `save` of a JPEG."""
     rationals = {
         Base.ExposureTime: exposure.shutter_s,
         Base.FNumber: exposure.aperture,
@@ -56,7 +56,7 @@ def exif_of(exposure: Exposure) -> Image.Exif:
 
 
 def _number(value: object) -> float | None:
-    """A tag's value as a finite number, the first of several; None where it is none."""
+    """Convert a tag's value, or the first of several, to a finite number; None if it is none."""
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         value = value[0] if value else None
     if not isinstance(value, int | float | IFDRational):

@@ -1,4 +1,4 @@
-"""Finds photographs and the object mask of each: in a folder masks/ or mask/, as NAME_mask beside it, or in its alpha
+"""Photographs of a folder and their object masks: in masks/ or mask/, as NAME_mask beside the photo, or in its alpha
 channel."""
 
 from collections.abc import Callable, Sequence
@@ -8,11 +8,11 @@ from pathlib import Path
 from splatgraft.core.images import IMAGE_SUFFIXES, has_transparency, list_images, read_alpha, same_shape, stored_size
 
 PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
-"""Names under which photos lie in a capture: of COLMAP and nerfstudio, of 3DGS's convert.py, of RGB-D scanners."""
+"""Folders of photos in a capture, as in COLMAP and nerfstudio, 3DGS's convert.py, and RGB-D scanners."""
 _MASK_FOLDERS = ("masks", "mask")
 _MASK_ENDINGS = ("_mask", ".mask")
-"""What comes before the suffix of a mask beside its photo: by default in Metashape, and in RealityCapture."""
-_ALPHA_SAMPLES = 8  # number of files decoded to decide whether alpha channels are masks
+"""Ending of a mask's stem beside its photo: defaults of Metashape and of RealityCapture."""
+_ALPHA_SAMPLES = 8  # files decoded to decide whether alpha channels are masks
 
 
 @dataclass(frozen=True)
@@ -20,22 +20,22 @@ class PhotoFiles:
     """Photos without poses, and the mask of each."""
 
     paths: tuple[Path, ...]
-    """Sorted by name."""
+    """Photos, sorted by name."""
     masks: tuple[Path | None, ...] = ()
-    """White is the object; the photo itself where its alpha channel is the mask; empty where no photo has one."""
+    """Masks, white on the object; the photo itself if its alpha channel is the mask; empty if no photo has one."""
 
     def only(self, paths: Sequence[Path]) -> "PhotoFiles":
-        """Some of the photos, with their masks."""
+        """Select some of the photos, with their masks."""
         masks = dict(zip(self.paths, self.masks, strict=bool(self.masks)))
         return PhotoFiles(tuple(paths), tuple(masks[path] for path in paths) if masks else ())
 
 
 def find_photos(folder: Path) -> PhotoFiles:
-    """The photos in `folder`, or else in its images/, photos/, input/ or rgb/, with their masks; or in the DCIM/ of a
-    camera's card, or in the only folder in it.
+    """Find the photos of a folder and their masks.
 
-    Masks are looked for beside the photos and beside their folder; a file NAME_mask is a mask and no photo where
-    there is a photo NAME.
+    Photos lie in `folder` itself, in its images/, photos/, input/ or rgb/, in the DCIM/ of a camera's card, or in the
+    only folder inside. Masks lie beside the photos or beside their folder. A file NAME_mask is a mask if there is a
+    photo NAME.
     """
     for place in (folder, *(folder / name for name in PHOTO_FOLDERS)):
         if place.is_dir() and (paths := _photos(place)):
@@ -61,7 +61,7 @@ def _holds_photos(folder: Path) -> bool:
 
 
 def describe_masks(images: Sequence[Path], masks: Sequence[Path | None]) -> str:
-    """How many of `images` have masks, and where these were found, for people."""
+    """Describe how many of `images` have masks, and where these were found, for a message."""
     found = {image: mask for image, mask in zip(images, masks, strict=bool(masks)) if mask is not None}
     if not found:
         return "no masks"
@@ -73,7 +73,7 @@ def describe_masks(images: Sequence[Path], masks: Sequence[Path | None]) -> str:
 
 
 def check_mask(mask: Path, size: tuple[int, int]) -> None:
-    """Raise where a mask cannot be of an image with `size` (width, height)."""
+    """Raise ValueError if a mask does not fit an image of `size` (width, height)."""
     found = stored_size(mask)
     if not same_shape(found, size):
         expected = f"{size[0]}x{size[1]} px, as its image has, or those scaled"
@@ -81,7 +81,7 @@ def check_mask(mask: Path, size: tuple[int, int]) -> None:
 
 
 def _photos(folder: Path) -> list[Path]:
-    """Image files that are not masks of others."""
+    """List the image files that are not masks of others."""
     files = list_images(folder)
     stems = {path.stem for path in files}
     return [
@@ -92,7 +92,7 @@ def _photos(folder: Path) -> list[Path]:
 
 
 def masks_of(images: dict[Path, str], roots: Sequence[Path]) -> dict[Path, Path]:
-    """Masks by image, from the first place that has any; `images` gives their names inside the capture."""
+    """Find masks by image, in the first place that has any; `images` gives their names inside the capture."""
     for folder in (root / name for root in roots for name in _MASK_FOLDERS):
         if folder.is_dir():
             files = _by_folder_and_stem(folder)
@@ -106,9 +106,9 @@ def masks_of(images: dict[Path, str], roots: Sequence[Path]) -> dict[Path, Path]
 
 
 def _alpha_masks(paths: list[Path]) -> dict[Path, Path]:
-    """Alpha channels are masks where one of a few samples varies; many files have alpha 1 everywhere.
+    """Use alpha channels as masks if one of a few samples varies; many files have alpha 1 everywhere.
 
-    A photo that cannot be read has none: whether the capture goes on without it is not decided here.
+    An unreadable photo has no mask here; later checks decide whether the capture is usable without it.
     """
 
     def holds(test: Callable[[Path], bool], path: Path) -> bool:

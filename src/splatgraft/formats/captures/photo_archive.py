@@ -1,4 +1,4 @@
-"""Photos that come in a .zip file, as phones and cloud services hand them out."""
+"""Photos in a .zip file, as phones and cloud services offer them."""
 
 import shutil
 import zipfile
@@ -10,11 +10,11 @@ from pathlib import Path, PurePosixPath
 from splatgraft.core.images import IMAGE_SUFFIXES
 
 _MAX_FILES = 20_000
-_MAX_BYTES = 32 << 30  # of all photos together
+_MAX_BYTES = 32 << 30  # unpacked, of all photos
 _MAX_RATIO = 20  # unpacked over packed bytes; photos are compressed already, and masks are small
-_SMALL = 256 << 20  # bytes up to which the ratio does not matter
+_SMALL = 256 << 20  # bytes below which any ratio is accepted
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""Of the others zipfile unpacks each part that it reads whole, which may be thousands of times as large."""
+"""Accepted compression: zipfile unpacks each block of the others whole, which may be thousands of times larger."""
 
 
 def is_archive(path: Path) -> bool:
@@ -23,23 +23,23 @@ def is_archive(path: Path) -> bool:
 
 
 def count_archived_photos(archive: Path) -> int:
-    """How many photos and masks are in a .zip file, which is not unpacked."""
+    """Count the photos and masks in a .zip file without unpacking it."""
     with _opened(archive) as (_, members):
         return len(members)
 
 
 def unpack_photos(archive: Path, folder: Path) -> Path:
-    """Write the photos and masks in a .zip file to `folder`, in the folders that they have there.
+    """Unpack the photos and masks of a .zip file to `folder`, with the archive's folders.
 
     Args:
-        archive: A .zip file; what is no picture in it is left out.
-        folder: Made by this function; it has all photos, or does not exist.
+        archive: A .zip file; files that are no images are left out.
+        folder: A new folder; it has all photos at the end, or does not exist.
 
     Returns:
         `folder`.
 
     Raises:
-        ValueError: It is damaged, encrypted or without photos, or it names files outside of its folder, or is larger
+        ValueError: The archive is damaged, encrypted or without photos, names files outside of its folder, or is larger
             than any capture.
     """
     partial = folder.with_name(f".{folder.name}.partial")
@@ -50,7 +50,7 @@ def unpack_photos(archive: Path, folder: Path) -> Path:
                 target = partial / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with opened.open(member) as packed, target.open("wb") as out:
-                    # zipfile reads no more than the size that was checked
+                    # zipfile reads at most the size that was checked
                     shutil.copyfileobj(packed, out)
         partial.rename(folder)
     finally:
@@ -60,7 +60,7 @@ def unpack_photos(archive: Path, folder: Path) -> Path:
 
 @contextmanager
 def _opened(archive: Path) -> Iterator[tuple[zipfile.ZipFile, list[tuple[zipfile.ZipInfo, PurePosixPath]]]]:
-    """An archive and the members that are pictures, checked."""
+    """Open an archive, and check its members that are images."""
     expected = f"{archive}: expected a .zip of photos, found"
     try:
         with zipfile.ZipFile(archive) as opened:
@@ -78,7 +78,7 @@ def _opened(archive: Path) -> Iterator[tuple[zipfile.ZipFile, list[tuple[zipfile
                 raise ValueError(f"{expected} no photo in it")
             yield opened, members
     except (zipfile.BadZipFile, RuntimeError, NotImplementedError, EOFError, zlib.error) as error:
-        # RuntimeError is what zipfile raises for a password
+        # zipfile raises RuntimeError for a password
         raise ValueError(f"{expected} one that cannot be read ({error})") from None
 
 

@@ -1,6 +1,6 @@
-"""Reads and writes transforms.json: cameras and photographs with the keys of Blender and nerfstudio, OpenGL axes.
+"""transforms.json: cameras and photographs with the keys of Blender and nerfstudio, OpenGL axes.
 
-Also reads cameras.json, which the original 3DGS code writes beside a scene.
+cameras.json, which the original 3DGS code writes beside a scene, is read as well.
 """
 
 import math
@@ -25,7 +25,7 @@ _CAMERA_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENC
 
 
 def read_json(path: Path) -> CaptureFile:
-    """The capture that a transforms.json describes, or the cameras of a cameras.json, which is a list."""
+    """Read the capture of a transforms.json, or the cameras of a cameras.json, which is a list."""
     meta = load(path)
     if isinstance(meta, list):
         return _cameras_json(path, meta)
@@ -41,7 +41,7 @@ def read_json(path: Path) -> CaptureFile:
 
 
 def _cameras_json(path: Path, entries: list[Any]) -> CaptureFile:
-    """OpenCV axes, principal points at the centre, as the file has none; no images."""
+    """Read cameras with OpenCV axes and without images; the file has no principal points, so they are at the centre."""
     views = []
     for index, entry in enumerate(entries):
         if not isinstance(entry, dict):
@@ -127,14 +127,14 @@ def _focal(path: Path, camera: dict[str, Any], axis: str, extent: int) -> float 
 
 
 def _image_file(path: Path) -> Path | None:
-    """The file, or with Blender's missing suffix added."""
+    """Find the image file, adding a suffix that Blender may omit."""
     suffixes = ["", *sorted(IMAGE_SUFFIXES)] if path.suffix.lower() not in IMAGE_SUFFIXES else [""]
     candidates = [path.with_name(path.name + suffix) for suffix in suffixes]
     return next((found for found in map(existing_file, candidates) if found), None)
 
 
 def write_cameras(path: Path, cameras: Cameras) -> None:
-    """Write cameras without images; poses and intrinsics are read back exactly."""
+    """Write cameras without images; poses and intrinsics are restored exactly on reading."""
     frames = [{"file_path": name, **_frame(cameras, i, None)} for i, name in enumerate(cameras.names)]
     _dump(path, {"camera_model": "OPENCV"}, frames)
 
@@ -154,12 +154,12 @@ def write_capture(folder: Path, posed_images: PosedImages) -> None:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """Relative path with resolved folders; a symbolic link keeps its own name."""
+    """Make a path relative, with resolved folders; a symbolic link keeps its own name."""
     return (Path(os.path.relpath(path.parent.resolve(), folder.resolve())) / path.name).as_posix()
 
 
 def _frame(cameras: Cameras, index: int, distortion: Distortion | None) -> dict[str, Any]:
-    """Intrinsics of the file's pixels, at the camera's size: the distorted camera's where the image is distorted."""
+    """Make a frame; intrinsics, at the camera's size, are the distorted camera's if the image is distorted."""
     width, height = cameras.sizes[index].tolist()
     matrix = cameras.intrinsics[index].double().cpu().numpy()
     out: dict[str, Any] = {"w": width, "h": height}
@@ -176,7 +176,7 @@ def _frame(cameras: Cameras, index: int, distortion: Distortion | None) -> dict[
 
 
 def _dump(path: Path, shared: dict[str, Any], frames: list[dict[str, Any]]) -> None:
-    """Write keys with one value in all frames once, as nerfstudio does."""
+    """Write the file; keys with one value in all frames appear once, as in nerfstudio's files."""
     if not frames:
         raise ValueError(f"{path}: expected at least one camera to write, found none")
     same = [k for k in ("w", "h", "fl_x", "fl_y", "cx", "cy", *_COEFFICIENTS) if k in frames[0]]

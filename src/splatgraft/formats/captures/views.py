@@ -1,6 +1,9 @@
-"""The value `ViewRecord`, one photograph with its camera as a capture file describes it, and captures made of these.
+"""The value `ViewRecord`, a photograph with its camera as a capture file describes it, and captures made of them.
 
-Image sizes are checked against the files, distortion is separated from pinhole cameras, and masks are found.
+- Image sizes are checked against the image files.
+- Distortion is separated from pinhole cameras.
+- Masks are found.
+- Views that fail are left out, with the reason.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,10 +23,9 @@ from splatgraft.core.posed_images import LeftOut, PosedImages
 from splatgraft.formats.captures.masks import check_mask, masks_of
 
 MIN_SHARE = 0.5
-"""Share of the images that a capture names, and of its masks, that must be usable; with fewer, the folder is not the
-one that was meant."""
+"""Minimum share of a capture's images, and of its masks, that must be usable; below, it is likely the wrong folder."""
 
-_RIGID_TOLERANCE = 1e-3  # largest entry of R^T R - I; allows matrices printed with four digits
+_RIGID_TOLERANCE = 1e-3  # largest entry of R^T R - I; accepts matrices printed with four digits
 
 MAX_SIDE = 32766
 """Longest image side, pixels: OpenCV cannot undistort longer ones."""
@@ -34,19 +36,19 @@ class ViewRecord:
     """One photograph with its camera, as a capture file describes it."""
 
     name: str
-    """Path of the image as the capture writes it."""
+    """Path of the image in the capture file."""
     image_path: Path | None
-    """The image file; None where it does not exist."""
+    """Image file; None if it does not exist."""
     world_from_camera: np.ndarray
-    """(4, 4), rigid, OpenCV axes."""
+    """Rigid pose (4, 4), OpenCV axes."""
     focal: tuple[float, float]
-    """fx, fy, pixels of `size`."""
+    """Focal lengths fx, fy, pixels of `size`."""
     center: tuple[float, float]
-    """cx, cy, pixels of `size`, pixel centres at +0.5."""
+    """Principal point cx, cy, pixels of `size`, pixel centres at +0.5."""
     size: tuple[int, int]
-    """Width, height."""
+    """Width and height, pixels."""
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3 as in OpenCV."""
+    """OpenCV's k1, k2, p1, p2, k3."""
     mask_path: Path | None = None
 
 
@@ -55,19 +57,19 @@ class CaptureFile:
     """A capture as its file describes it."""
 
     source: Path
-    """The file, for messages."""
+    """File name for messages."""
     folder: Path
-    """Where masks/ is looked for."""
+    """Folder in which masks/ is searched."""
     views: Sequence[ViewRecord | LeftOut]
-    """One per photograph, or why it is left out."""
+    """View of each photograph, or the reason why it is left out."""
     points: Callable[[], tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]] = lambda: (
         torch.zeros(0, 3),
         torch.zeros(0, 3),
     )
-    """Reads sparse points, world units, and their colours, sRGB in [0, 1]."""
+    """Reader of sparse points, world units, and their colours, sRGB in [0, 1]."""
 
     def records(self) -> list[ViewRecord]:
-        """All views."""
+        """Return all views, or raise ValueError if one is left out."""
         for view in self.views:
             if isinstance(view, LeftOut):
                 raise ValueError(view.reason)
@@ -75,7 +77,7 @@ class CaptureFile:
 
 
 def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
-    """The pose (4, 4) with its rotation made orthonormal in float64."""
+    """Check a pose (4, 4), and make its rotation orthonormal in float64."""
     rotation = matrix[:3, :3]
     if not np.isfinite(matrix).all() or np.abs(matrix).max() > 1e30:
         raise ValueError(f"{where}: expected a pose of finite numbers, found nan, infinity or more than 1e30")
@@ -97,7 +99,7 @@ def rigid(matrix: np.ndarray, where: str) -> np.ndarray:
 
 
 def existing_file(path: Path) -> Path | None:
-    """`path` where it is a file, otherwise None, also for invalid file names."""
+    """Return `path` if it is a file, else None, also for invalid file names."""
     try:
         return path if path.is_file() else None
     except (OSError, ValueError):
@@ -105,7 +107,7 @@ def existing_file(path: Path) -> Path | None:
 
 
 def posed_images(file: CaptureFile, *, with_points: bool = True) -> PosedImages:
-    """The capture without views whose image is missing or unreadable or does not fit its camera."""
+    """Make a capture of the views whose image is readable and fits its camera."""
 
     def usable(view: ViewRecord) -> ViewRecord:
         if view.image_path is None:
@@ -134,12 +136,12 @@ def posed_images(file: CaptureFile, *, with_points: bool = True) -> PosedImages:
 
 
 def cameras(file: CaptureFile) -> Cameras:
-    """The pinhole cameras of the undistorted views; images need not exist."""
+    """Make the pinhole cameras of the undistorted views; images need not exist."""
     return _cameras_of([fitted_to_file(view, file.source) for view in file.records()], file.source)[0]
 
 
 def view_or_reason(name: str, read: Callable[[], ViewRecord]) -> ViewRecord | LeftOut:
-    """The view that `read` gives, or, where its values are not usable, why it is left out."""
+    """Return the view that `read` gives, or the reason why its values are unusable."""
     try:
         return read()
     except ValueError as error:
@@ -147,9 +149,9 @@ def view_or_reason(name: str, read: Callable[[], ViewRecord]) -> ViewRecord | Le
 
 
 def _with_masks(views: list[ViewRecord], folder: Path) -> tuple[list[ViewRecord], list[LeftOut]]:
-    """The views with their masks; a mask that is missing, unreadable or of another shape is left out, with the reason.
+    """Add masks to the views; unreadable masks and those of another shape are left out, with the reason.
 
-    A mask that a view already has stays.
+    Masks that views already have stay.
     """
     if not any(view.mask_path for view in views):
         masks = masks_of({view.image_path: view.name for view in views if view.image_path is not None}, [folder])
@@ -167,7 +169,7 @@ def _with_masks(views: list[ViewRecord], folder: Path) -> tuple[list[ViewRecord]
 
 
 def _require_share(kept: int, left_out: Sequence[LeftOut], what: str, source: Path) -> None:
-    """Raises: ValueError with the first reason, where less than `MIN_SHARE` is left."""
+    """Raise ValueError with the first reason if less than `MIN_SHARE` is left."""
     total = kept + len(left_out)
     if not left_out or kept >= MIN_SHARE * total:
         return
@@ -180,9 +182,9 @@ def _require_share(kept: int, left_out: Sequence[LeftOut], what: str, source: Pa
 
 
 def fitted_to_file(view: ViewRecord, source: Path) -> ViewRecord:
-    """The view with intrinsics for its file's size, where that is smaller than the camera's and of the same shape.
+    """Scale a view's intrinsics to the size of its file, if that is smaller than the camera's and of the same shape.
 
-    For a larger file of the same shape the camera's size stays: the image is resampled on reading.
+    If the file is larger, the camera's size stays, because the image is resampled on reading.
     """
     if view.image_path is None:
         return view
@@ -200,7 +202,7 @@ def fitted_to_file(view: ViewRecord, source: Path) -> ViewRecord:
 
 
 def _cameras_of(views: Sequence[ViewRecord], source: Path) -> tuple[Cameras, tuple[Distortion | None, ...]]:
-    """The pinhole cameras of the undistorted views, and the distortion of each file."""
+    """Make the pinhole cameras of the undistorted views, and the distortion of each file."""
     found = [_pinhole(view, source) for view in views]
     intrinsics = np.array([matrix for matrix, _ in found]).reshape(-1, 3, 3)
     cameras = Cameras(
@@ -213,7 +215,7 @@ def _cameras_of(views: Sequence[ViewRecord], source: Path) -> tuple[Cameras, tup
 
 
 def _pinhole(view: ViewRecord, source: Path) -> tuple[np.ndarray, Distortion | None]:
-    """Intrinsics of the undistorted view, and its distortion."""
+    """Compute the intrinsics of the undistorted view, and its distortion."""
     numbers = np.array([*view.focal, *view.center, *view.distortion])
     if not np.isfinite(numbers).all() or min(view.focal) <= 0 or np.abs(numbers).max() > 1e7:
         raise ValueError(
@@ -232,7 +234,7 @@ def _pinhole(view: ViewRecord, source: Path) -> tuple[np.ndarray, Distortion | N
 
 
 def _unique_names(views: Sequence[ViewRecord], source: Path) -> tuple[str, ...]:
-    """File names, prefixed by as many folders as make them unique, joined by underscores."""
+    """Name views by their files, with as many folders before as make the names unique, joined by underscores."""
     parts = [[p for p in Path(v.image_path or v.name).parts if p not in ("..", ".", "/")] for v in views]
     for depth in range(1, 1 + max(map(len, parts), default=0)):
         names = tuple("_".join(part[-depth:]) for part in parts)

@@ -1,7 +1,7 @@
-"""Changes the axes of a scene exactly: signed permutations, named by the directions of x, y and z.
+"""Exact changes of a scene's axes: signed permutations, named by the directions of x, y and z.
 
-Names are those of the .spz library: L or R, D or U, B or F for each of x, y, z. A .ply of the original code has RDF, as
-structure from motion has.
+Names follow the .spz library: L or R, D or U, B or F for each of x, y, z. A .ply of the original code has RDF, the axes
+of structure from motion.
 """
 
 from dataclasses import replace
@@ -15,19 +15,19 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
 
 _DIRECTIONS = {"L": (-1, 0, 0), "R": (1, 0, 0), "U": (0, -1, 0), "D": (0, 1, 0), "B": (0, 0, -1), "F": (0, 0, 1)}
-"""In the axes RDF."""
+"""Unit directions in the axes RDF, by letter."""
 
 
 def rdf_from(name: str) -> Float[Tensor, "3 3"]:
-    """The matrix that takes coordinates in the axes `name`, such as RUB, to RDF; a reflection for left-handed axes."""
+    """Return the matrix from the axes `name`, such as RUB, to RDF; a reflection for left-handed axes."""
     return torch.tensor([_DIRECTIONS[letter] for letter in name], dtype=torch.float32).T
 
 
 def change_axes(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians:
-    """The scene in other axes; `matrix` is a signed permutation, new from old, whose determinant may be -1."""
+    """Change the axes of a scene; `matrix` is a signed permutation, new from old, of determinant 1 or -1."""
     g = gaussians
     permutation = matrix.abs()
-    # matrix @ R @ matrix.T is a rotation whose axis turns as a pseudovector; it acts on permuted own axes
+    # matrix @ R @ matrix.T is a rotation whose axis is transformed as a pseudovector; it acts on permuted own axes
     axis = torch.linalg.det(matrix).round() * (g.quaternions[:, 1:] @ matrix.T)
     harmonics = spherical_harmonics.rotation_matrix(matrix, g.sh_degree)
     if torch.equal(permutation, torch.eye(3)):
@@ -42,7 +42,7 @@ def change_axes(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians
 
 
 def turn_up(metadata: SceneMetadata, matrix: Float[Tensor, "3 3"]) -> SceneMetadata:
-    """The metadata of a scene in other axes; `matrix` as for `change_axes`."""
+    """Change the axes of the metadata; `matrix` as for `change_axes`."""
     if metadata.up is None:
         return metadata
     x, y, z = (matrix @ torch.tensor(metadata.up)).tolist()
@@ -50,7 +50,7 @@ def turn_up(metadata: SceneMetadata, matrix: Float[Tensor, "3 3"]) -> SceneMetad
 
 
 def with_axes(scene: SceneFile, axes: str) -> SceneFile:
-    """The scene, with the file's axes taken to be `axes` instead of those that were found."""
+    """Read the file's axes as `axes` instead of the format's."""
     name = axes.upper()
     if len(name) != 3 or any(sum(letter in pair for letter in name) != 1 for pair in ("LR", "UD", "BF")):
         raise ValueError(f"axes: expected directions of x, y and z such as RDF, RUB or LUF, found {axes[:20]!r}")

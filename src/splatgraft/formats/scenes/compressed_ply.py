@@ -1,7 +1,7 @@
-"""Reads and writes SuperSplat's compressed .ply: chunks of 256 Gaussians, quantised between each chunk's bounds.
+"""SuperSplat's compressed .ply: chunks of 256 Gaussians, quantised between the chunk's bounds.
 
 Layout (PlayCanvas): element chunk with min and max of position, log scale and, in newer files, colour; element vertex
-with four packed uint32; optional element sh with 8-bit f_rest. Written ones are sorted along a Morton curve.
+with four packed uint32; optional element sh with 8-bit f_rest. The writer sorts Gaussians along a Morton curve.
 """
 
 from pathlib import Path
@@ -33,19 +33,14 @@ _LARGEST_LOG_SCALE = 20.0
 _HALF_SQRT2 = 0.5**0.5
 
 
-def is_compressed(header: ply.PlyHeader) -> bool:
-    """Whether the file has SuperSplat's packed vertices."""
-    vertex = header.element("vertex")
-    return vertex is not None and set(_PACKED) <= set(vertex.types)
+def is_compressed(vertex: ply.Element) -> bool:
+    """Whether the vertices are SuperSplat's packed ones."""
+    return set(_PACKED) <= set(vertex.types)
 
 
 def read_compressed_ply(header: ply.PlyHeader) -> Gaussians:
-    """The scene in a compressed .ply."""
-    vertex, chunk, sh = (header.element(name) for name in ("vertex", "chunk", "sh"))
-    assert vertex is not None
-    if chunk is None or chunk.count * _CHUNK < vertex.count:
-        found = chunk.count if chunk else 0
-        raise ValueError(f"{header.path}: expected one chunk for {_CHUNK} packed Gaussians, found {found}")
+    """Read a compressed .ply."""
+    vertex, chunk, sh = header.required("vertex"), header.required("chunk"), header.element("sh")
     columns = {name: np.empty(vertex.count, np.int64) for name in _PACKED}
     ply.read_into(header, vertex, list(columns.items()))
     position, rotation, scale, color = map(torch.from_numpy, columns.values())
@@ -71,27 +66,22 @@ def read_compressed_ply(header: ply.PlyHeader) -> Gaussians:
 
 
 def _unpacked(packed: Int64[Tensor, "n"], bits: tuple[int, ...]) -> Float[Tensor, "n c"]:
-    """Values in [0, 1] that lie side by side, the last in the lowest bits."""
+    """Unpack values in [0, 1] that lie side by side, the last in the lowest bits."""
     shifts = [sum(bits[i + 1 :]) for i in range(len(bits))]
     parts = [(packed >> at & (1 << width) - 1) / ((1 << width) - 1) for at, width in zip(shifts, bits, strict=True)]
     return torch.stack(parts, 1).float()
 
 
 def _bands(header: ply.PlyHeader, sh: ply.Element, count: int) -> Float[Tensor, "n k 3"]:
-    """Bytes to [-4, 4], channel-major as in a plain .ply."""
+    """Decode bytes to [-4, 4]; channel-major as in a plain .ply."""
     names = tuple(f"f_rest_{i}" for i in range(len(sh.types)))
-    if sh.count != count or len(names) not in (9, 24, 45) or set(names) != set(sh.types):
-        raise ValueError(
-            f"{header.path}: expected {count} rows of 9, 24 or 45 f_rest in element 'sh', "
-            f"found {sh.count} rows of {len(names)}"
-        )
     values = torch.from_numpy(ply.read_columns(header, sh, names))
     unit = torch.where(values == 0, 0.0, torch.where(values == 255, 1.0, (values + 0.5) / 256))
     return ((unit - 0.5) * 8).reshape(count, 3, len(names) // 3).transpose(1, 2).contiguous()
 
 
 def write_compressed_ply(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
-    """Write positions and log scales in 11, 10 and 11 bits of each chunk's bounds, the rest in 8 to 10 bits."""
+    """Write positions and log scales in 11, 10 and 11 bits of the chunk's bounds, the rest in 8 to 10 bits."""
     g = writable(path, gaussians)
     g = g.select(morton_order(g.means))
     log_scales = g.log_scales.clamp(-_LARGEST_LOG_SCALE, _LARGEST_LOG_SCALE)
@@ -123,7 +113,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians, metadata: SceneMetada
 
 
 def _packed(unit: Float[Tensor, "n c"], bits: tuple[int, ...]) -> Int64[Tensor, "n"]:
-    """Values of [0, 1] side by side, the last in the lowest bits."""
+    """Pack values in [0, 1] side by side, the last in the lowest bits."""
     out = torch.zeros(len(unit), dtype=torch.int64)
     for column, width in enumerate(bits):
         most = (1 << width) - 1

@@ -1,9 +1,9 @@
-"""Reads and writes binary glTF with KHR_gaussian_splatting (ratified 2026).
+"""Binary glTF with KHR_gaussian_splatting (ratified 2026).
 
-Attributes of a POINTS primitive: ROTATION (xyzw), SCALE (linear), OPACITY (linear), SH_DEGREE_l_COEF_n; float32 where
-written, also normalised integers where read. Transforms of nodes are applied. glTF's unit is the metre and its axes are
-left-up-front; they are turned to and from those of a .ply, and a scene is as upright and as large as it is given. The
-asset's extras say which way is up in the file's own axes, and how large a unit is.
+Attributes of a POINTS primitive: ROTATION (xyzw), SCALE (linear), OPACITY (linear), SH_DEGREE_l_COEF_n. The writer uses
+float32; the reader accepts normalised integers as well, and applies the transforms of nodes. glTF's axes are
+left-up-front and are turned to and from those of a .ply. Its unit is the metre, but scenes are neither set upright nor
+scaled here; the asset's extras state the up direction in the file's axes, and the metres per unit.
 """
 
 import json
@@ -26,9 +26,9 @@ from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata, state
 from splatgraft.runtime.files import atomic_write
 
 AXES = "LUF"
-"""Left, up, front."""
-_GENERATOR = "splatgraft"  # whose extras are understood: those of other programs may mean anything
-_SPLATTING = "KHR_gaussian_splatting"  # the extension's name, which stands before those of its attributes as well
+"""Axes of the file: left, up, front."""
+_GENERATOR = "splatgraft"  # extras of other programs may mean anything, and are not read
+_SPLATTING = "KHR_gaussian_splatting"  # the extension, and the prefix of its attributes
 _MAGIC, _VERSION, _JSON, _BINARY = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -40,33 +40,33 @@ _OPACITY_STEP = 0.25 / 65535  # opacities of 0 and 1 become finite logits, by a 
 
 
 def read_gaussian_glb(path: Path) -> SceneFile:
-    """The Gaussians of all primitives, placed by their nodes."""
+    """Read the Gaussians of all primitives, placed by their nodes."""
     content, binary = _parts(path)
     notes: list[str] = []
     parts: list[Gaussians] = []
-    for mesh, matrix in _placed_meshes(path, content):
+    for mesh, matrix in _placed_meshes(content):
         for primitive in mesh["primitives"]:
             if _SPLATTING in primitive.get("extensions", {}):
-                part, said = _gaussians(path, content, binary, primitive)
+                part, said = _gaussians(content, binary, primitive)
                 notes += [note for note in said if note not in notes]
-                parts.append(_placed(path, part, matrix))
+                parts.append(_placed(part, matrix))
     if not parts:
-        raise ValueError(f"{path}: expected Gaussians ({_SPLATTING}), found a .glb without")
+        raise ValueError(f"expected Gaussians ({_SPLATTING}), found a .glb without")
     gaussians = change_axes(concatenate(parts), rdf_from(AXES))
     return SceneFile(gaussians, AXES, metadata=_metadata(content["asset"]), notes=tuple(notes))
 
 
 def _metadata(asset: dict[str, Any]) -> SceneMetadata:
-    """What our own writer stated, in the axes of a .ply."""
+    """Read the extras that our writer states, in the axes of a .ply."""
     extras = asset.get("extras", {}) if asset.get("generator") == _GENERATOR else {}
     return turn_up(stated_metadata(extras.get("up"), extras.get("metres_per_unit")), rdf_from(AXES))
 
 
 def _parts(path: Path) -> tuple[dict[str, Any], bytes]:
-    """The JSON and the buffer."""
+    """Split the file into its JSON and its buffer."""
     data = path.read_bytes()
     if struct.unpack_from("<II", data) != (_MAGIC, _VERSION):
-        raise ValueError(f"{path}: expected binary glTF of version 2, found {data[:8]!r}")
+        raise ValueError(f"expected binary glTF of version 2, found {data[:8]!r}")
     chunks: dict[int, bytes] = {}
     at = 12
     while at + 8 <= len(data):
@@ -76,13 +76,13 @@ def _parts(path: Path) -> tuple[dict[str, Any], bytes]:
     return json.loads(chunks[_JSON]), chunks.get(_BINARY, b"")
 
 
-def _placed_meshes(path: Path, content: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Float[np.ndarray, "4 4"]]]:
-    """Each mesh of the default scene and the transform that places it."""
+def _placed_meshes(content: dict[str, Any]) -> Iterator[tuple[dict[str, Any], Float[np.ndarray, "4 4"]]]:
+    """Yield each mesh of the default scene and the transform that places it."""
     waiting = [(index, np.eye(4), 0) for index in content["scenes"][content.get("scene", 0)]["nodes"]]
     while waiting:
         index, parent, depth = waiting.pop(0)
         if depth > _MAX_DEPTH:
-            raise ValueError(f"{path}: expected nodes without cycles, found more than {_MAX_DEPTH} in one another")
+            raise ValueError(f"expected nodes without cycles, found more than {_MAX_DEPTH} levels")
         node = content["nodes"][index]
         matrix = parent @ _matrix(node)
         if "mesh" in node:
@@ -91,7 +91,7 @@ def _placed_meshes(path: Path, content: dict[str, Any]) -> Iterator[tuple[dict[s
 
 
 def _matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
-    """parent_from_node; column-major, or translation, rotation xyzw and scale."""
+    """Compute parent_from_node, given as a column-major matrix, or as translation, rotation xyzw and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = node.get("rotation", [0, 0, 0, 1])
@@ -102,25 +102,21 @@ def _matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     return matrix
 
 
-def _gaussians(
-    path: Path, content: dict[str, Any], binary: bytes, primitive: dict[str, Any]
-) -> tuple[Gaussians, tuple[str, ...]]:
-    """One primitive in glTF's axes, and what is said of it."""
+def _gaussians(content: dict[str, Any], binary: bytes, primitive: dict[str, Any]) -> tuple[Gaussians, tuple[str, ...]]:
+    """Read one primitive in glTF's axes; returns notes for the user as well."""
     extension, attributes = primitive["extensions"][_SPLATTING], primitive["attributes"]
     kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", "srgb_rec709_display")
     if kernel != "ellipse":
-        raise ValueError(f"{path}: expected the kernel 'ellipse', found {str(kernel)[:60]!r}")
-    notes = () if space == "srgb_rec709_display" else (f"its colours are {str(space)[:60]!r}, and are taken for sRGB",)
+        raise ValueError(f"expected the kernel 'ellipse', found {str(kernel)[:60]!r}")
+    notes = () if space == "srgb_rec709_display" else (f"its colours are {str(space)[:60]!r}; they are read as sRGB",)
 
     def values(name: str, kind: str) -> Float[np.ndarray, "n c"]:
-        if name not in attributes:
-            raise ValueError(f"{path}: expected the attribute {name}, found {', '.join(attributes)[:60]}")
-        return _accessor(path, content, binary, content["accessors"][attributes[name]], kind)
+        return _accessor(content, binary, content["accessors"][attributes[name]], kind)
 
     rotations, scales = values(f"{_SPLATTING}:ROTATION", "VEC4"), values(f"{_SPLATTING}:SCALE", "VEC3")
     if bool((scales < 0).any()):
         log_scales = scales
-        notes = (*notes, "its scales are negative, thus logarithms, as before the extension was ratified")
+        notes = (*notes, "its scales are negative; they are read as logarithms, which drafts of the extension had")
     else:
         log_scales = np.log(np.maximum(scales, SMALLEST_SCALE))
     degree = sum(f"{_SPLATTING}:SH_DEGREE_{d}_COEF_0" in attributes for d in (1, 2, 3))
@@ -133,23 +129,19 @@ def _gaussians(
         opacity_logits=opacities.clamp(_OPACITY_STEP, 1 - _OPACITY_STEP).logit(),
         sh=torch.from_numpy(np.stack(coefficients, 1)),
     )
-    if len({len(field) for field in vars(gaussians).values()}) > 1:
-        raise ValueError(f"{path}: expected as many values of each attribute, found different numbers")
     return gaussians, notes
 
 
 def _harmonics(degree: int) -> list[str]:
-    """Names of the attributes of all bands up to a degree."""
+    """List the attributes of all bands up to a degree."""
     return [f"{_SPLATTING}:SH_DEGREE_{d}_COEF_{i}" for d in range(degree + 1) for i in range(2 * d + 1)]
 
 
-def _accessor(
-    path: Path, content: dict[str, Any], binary: bytes, accessor: dict[str, Any], kind: str
-) -> Float[np.ndarray, "n c"]:
-    """An accessor's values; integers become [0, 1] or [-1, 1] where it is normalised."""
+def _accessor(content: dict[str, Any], binary: bytes, accessor: dict[str, Any], kind: str) -> Float[np.ndarray, "n c"]:
+    """Read an accessor's values; normalised integers become [0, 1] or [-1, 1]."""
     view = content["bufferViews"][accessor["bufferView"]]
     if accessor["type"] != kind or "sparse" in accessor or view["buffer"] != 0 or "uri" in content["buffers"][0]:
-        raise ValueError(f"{path}: expected a plain accessor of {kind} in the .glb itself, found another")
+        raise ValueError(f"expected a plain accessor of {kind} in the .glb itself, found another")
     dtype, width, count = np.dtype(_COMPONENTS[accessor["componentType"]]), _WIDTHS[kind], accessor["count"]
     start = view.get("byteOffset", 0)
     data = binary[start : start + view["byteLength"]]
@@ -160,18 +152,18 @@ def _accessor(
     return np.maximum(out / np.iinfo(dtype).max, -1) if accessor.get("normalized") and dtype.kind in "iu" else out
 
 
-def _placed(path: Path, gaussians: Gaussians, matrix: Float[np.ndarray, "4 4"]) -> Gaussians:
-    """The Gaussians in the frame of the scene."""
+def _placed(gaussians: Gaussians, matrix: Float[np.ndarray, "4 4"]) -> Gaussians:
+    """Transform the Gaussians to the frame of the scene."""
     linear = matrix[:3, :3]
     scale = float(np.cbrt(np.linalg.det(linear)))
     if not scale > 1e-9 or not np.abs(linear / scale @ (linear / scale).T - np.eye(3)).max() < _RIGID:
-        raise ValueError(f"{path}: expected nodes that rotate and scale uniformly, found another transform")
+        raise ValueError("expected nodes that rotate and scale uniformly, found another transform")
     rotation, translation = torch.from_numpy(linear / scale).float(), torch.from_numpy(matrix[:3, 3]).float()
     return Similarity(scale, rotation, translation).gaussians(gaussians)
 
 
 def write_gaussian_glb(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
-    """Write all fields exactly but for the exponentials of scales and opacities; metadata as the asset's extras."""
+    """Write all fields exactly, except scales and opacities, which are converted; metadata as the asset's extras."""
     arrays = _attributes(change_axes(writable(path, gaussians), rdf_from(AXES).T))
     kinds = {width: kind for kind, width in _WIDTHS.items()}
     views, accessors, at = [], [], 0
@@ -183,7 +175,7 @@ def write_gaussian_glb(path: Path, gaussians: Gaussians, metadata: SceneMetadata
         accessors.append({"bufferView": len(accessors), **component, **shape})
         views.append({"buffer": 0, "byteOffset": at, "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
         at += values.nbytes
-    # the specification asks for these of positions
+    # the specification requires bounds of positions
     accessors[0] |= {"min": arrays["POSITION"].min(0).tolist(), "max": arrays["POSITION"].max(0).tolist()}
     splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     primitive = {
@@ -218,7 +210,7 @@ def write_gaussian_glb(path: Path, gaussians: Gaussians, metadata: SceneMetadata
 
 
 def _attributes(g: Gaussians) -> dict[str, np.ndarray]:
-    """Attribute to rows of float32, positions first; bytes of a colour for programs without the extension."""
+    """Collect float32 rows by attribute, positions first, and COLOR_0 bytes for programs without the extension."""
     unit = torch.nn.functional.normalize(g.quaternions, dim=1)
     values = {
         "POSITION": g.means,

@@ -1,9 +1,9 @@
-"""Reads and writes 3DGS scenes as .ply; the raw fields are stored exactly.
+"""3DGS scenes as .ply, which stores the raw fields exactly.
 
 Layout of the original code (Kerbl et al. 2023): x y z, nx ny nz (zeros), f_dc_0..2, f_rest (channel-major), opacity,
-scale_0..2, rot_0..3 (wxyz), all float32. Read in any order, with extra properties or without normals and f_rest.
-Values that are not finite are kept, so that reading and writing copies a file exactly; renderers cull them.
-What is known of the frame stands in comments `up: X Y Z` and `metres_per_unit: M`.
+scale_0..2, rot_0..3 (wxyz), all float32. The reader accepts any order, extra properties, and no normals or f_rest.
+Non-finite values are kept, so that reading and writing copies a file exactly; renderers cull them. Up direction and
+size are comments, `up: X Y Z` and `metres_per_unit: M`.
 """
 
 import re
@@ -24,21 +24,19 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REST_COUNTS = tuple(3 * (spherical_harmonics.coefficient_count(d) - 1) for d in range(4))
-_ROWS_PER_WRITE = 1 << 14
+_ROWS_PER_WRITE = 1 << 14  # bounds the memory of a write
 _KNOWN = re.compile(r"x|y|z|n[xyz]|f_dc_[0-2]|f_rest_[0-9]+|opacity|scale_[0-2]|rot_[0-3]|red|green|blue|alpha")
-"""Properties that are read, empty normals, and colours for viewers."""
+"""Properties that are read, normals, which are zeros, and colours for viewers."""
 _MAX_NAMED = 6  # properties that a note names
 
 
 def read_gaussian_ply(path: Path) -> SceneFile:
-    """The scene in a 3DGS .ply, or SuperSplat's compressed form of one; other number types become float32."""
+    """Read a 3DGS .ply, or SuperSplat's compressed form of one; other number types become float32."""
     header = ply.read_header(path)
-    vertex = header.element("vertex")
-    if vertex is None:
-        raise ValueError(f"{path}: expected an element 'vertex', found {[e.name for e in header.elements]}")
-    if is_compressed(header):
+    vertex = header.required("vertex")
+    if is_compressed(vertex):
         return SceneFile(read_compressed_ply(header), metadata=header.metadata)
-    rest = _require_gaussians(path, vertex)
+    rest = _require_gaussians(vertex)
     n, bands = vertex.count, len(rest) // 3
     means, log_scales, quaternions = (np.empty((n, width), np.float32) for width in (3, 3, 4))
     logits, sh = np.empty(n, np.float32), np.empty((n, 1 + bands, 3), np.float32)
@@ -55,20 +53,20 @@ def read_gaussian_ply(path: Path) -> SceneFile:
     return SceneFile(gaussians, metadata=header.metadata, notes=_unused(vertex))
 
 
-def _require_gaussians(path: Path, vertex: ply.Element) -> tuple[str, ...]:
-    """The names f_rest_0 .. in the order of their numbers, of a vertex that has all other properties of Gaussians."""
+def _require_gaussians(vertex: ply.Element) -> tuple[str, ...]:
+    """Check the properties, and return the names f_rest_0 .. in the order of their numbers."""
     missing = [n for n in (*_MEANS, *_DC, "opacity", *_SCALES, *_QUATERNION) if n not in vertex.types]
     if missing and not {*_MEANS, "opacity", *_SCALES, *_QUATERNION} & set(vertex.types) - set(_MEANS):
         raise ValueError(
-            f"{path}: expected 3D Gaussians (opacity, scale_0.., rot_0.., f_dc_0..), "
+            "expected 3D Gaussians (opacity, scale_0.., rot_0.., f_dc_0..), "
             f"found a plain point cloud with {', '.join(vertex.types)[:80]}"
         )
     if missing:
-        raise ValueError(f"{path}: expected the properties of 3D Gaussians, found none called {', '.join(missing)}")
+        raise ValueError(f"expected the properties of 3D Gaussians, found none called {', '.join(missing)}")
     count = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in vertex.types)
     names = tuple(f"f_rest_{i}" for i in range(count))
     if count not in _REST_COUNTS or not set(names) <= set(vertex.types):
-        raise ValueError(f"{path}: expected 0, 9, 24 or 45 properties f_rest_0 .. (SH degree 0 to 3), found {count}")
+        raise ValueError(f"expected 0, 9, 24 or 45 properties f_rest_0 .. (SH degree 0 to 3), found {count}")
     return names
 
 
@@ -79,7 +77,7 @@ def _unused(vertex: ply.Element) -> tuple[str, ...]:
 
 
 def write_gaussian_ply(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
-    """Write the layout of the original code, byte for byte, atomically; what is known of the frame in comments."""
+    """Write the layout of the original code, byte for byte, atomically; metadata become comments."""
     n, k = gaussians.sh.shape[:2]
     rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]
     names = [*_MEANS, "nx", "ny", "nz", *_DC, *rest, "opacity", *_SCALES, *_QUATERNION]

@@ -1,6 +1,6 @@
 """The PLY container (header, elements, properties; binary of both byte orders and ascii), and point clouds in it.
 
-Element counts of a header are checked against the size of the file before anything is allocated.
+Element counts are checked against the size of the file before memory is allocated.
 """
 
 import re
@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
+from splatgraft.formats.parsing import parsing
 from splatgraft.formats.scenes.scene_file import SceneMetadata, stated_metadata
 from splatgraft.runtime.files import atomic_write
 
@@ -29,7 +30,6 @@ _FORMATS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _POSITION = ("x", "y", "z")
 _COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-_GREY = 0.5
 _NUMBER = r"([+-]?[0-9]{1,12}(?:\.[0-9]{1,12})?(?:e[+-]?[0-9]{1,2})?)"
 _UP = re.compile(rf"up: {_NUMBER} {_NUMBER} {_NUMBER}")
 _METRES = re.compile(rf"metres_per_unit: {_NUMBER}")
@@ -37,15 +37,15 @@ _METRES = re.compile(rf"metres_per_unit: {_NUMBER}")
 
 @dataclass(frozen=True)
 class Element:
-    """A table of the file."""
+    """A table of a PLY file."""
 
     name: str
     count: int
     """Number of rows."""
     types: Mapping[str, str]
-    """numpy's type code without byte order, such as f4, by property, in order."""
+    """numpy's type codes without byte order, such as f4, by property in the file's order."""
     has_lists: bool = False
-    """Whether rows differ in length; such an element is not read."""
+    """Whether a property is a list; such an element is not read."""
 
 
 @dataclass(frozen=True)
@@ -59,28 +59,31 @@ class PlyHeader:
     data_start: int
     """Offset of the first byte after the header."""
     metadata: SceneMetadata
-    """What comments of our own writer state."""
+    """Up direction and size, from comments that splatgraft writes."""
 
     def element(self, name: str) -> Element | None:
-        """The element called `name`, or None."""
+        """Find the element called `name`."""
         return next((e for e in self.elements if e.name == name), None)
+
+    def required(self, name: str) -> Element:
+        """Return the element called `name`, or raise ValueError."""
+        found = self.element(name)
+        if found is None:
+            raise ValueError(f"expected an element '{name}', found {[e.name for e in self.elements]}")
+        return found
 
 
 def read_header(path: Path) -> PlyHeader:
-    """The header, with counts checked against the length of the file."""
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a .ply file, found none")
+    """Read the header, and check its counts against the length of the file."""
     with path.open("rb") as stream:
         head = stream.read(_MAX_HEADER_BYTES)
-    if not re.match(rb"ply[ \t]*\r?\n", head):
-        raise ValueError(f"{path}: expected a PLY file that starts with 'ply', found {head[:8]!r}")
-    end = re.search(rb"\nend_header[ \t]*\r?\n", head)
-    if end is None:
-        raise ValueError(f"{path}: expected 'end_header' within the first {len(head)} bytes, found none")
-    lines = head[: end.start()].decode("utf-8", "replace").splitlines()[1:]
-    order, elements = _parse(path, lines)
+    found = re.match(rb"ply[ \t]*\r?\n(.*?\n)end_header[ \t]*\r?\n", head, re.DOTALL)
+    if found is None:
+        raise ValueError(f"expected a PLY header from 'ply' to 'end_header', found {head[:8]!r} and so on")
+    lines = found[1].decode("utf-8", "replace").splitlines()
+    order, elements = _parse(lines)
     comments = [line[8:].strip() for line in lines if line.startswith("comment ")]
-    header = PlyHeader(path, order, elements, end.end(), _metadata(comments))
+    header = PlyHeader(path, order, elements, found.end(), _metadata(comments))
     _check_size(header)
     return header
 
@@ -95,7 +98,7 @@ def _metadata(comments: list[str]) -> SceneMetadata:
     return stated_metadata(up, metres)
 
 
-def _parse(path: Path, lines: list[str]) -> tuple[str, tuple[Element, ...]]:
+def _parse(lines: list[str]) -> tuple[str, tuple[Element, ...]]:
     order: str | None = None
     elements: list[Element] = []
     for line in lines:
@@ -112,14 +115,14 @@ def _parse(path: Path, lines: list[str]) -> tuple[str, tuple[Element, ...]]:
                 types = {**elements[-1].types, name: _TYPES[length]}
                 elements[-1] = replace(elements[-1], types=types, has_lists=True)
             case _:
-                raise ValueError(f"{path}: expected a PLY header line, found {line[:60]!r}")
+                raise ValueError(f"expected a PLY header line, found {line[:60]!r}")
     if order is None:
-        raise ValueError(f"{path}: expected a 'format' line in the PLY header, found none")
+        raise ValueError("expected a 'format' line in the PLY header, found none")
     return order, tuple(elements)
 
 
 def _check_size(header: PlyHeader) -> None:
-    """Each row of a list takes at least its length field; each ascii value a digit and a separator."""
+    """Check the counts; a list takes at least its length field, an ascii value a digit and a separator."""
     available, ascii_ = header.path.stat().st_size - header.data_start, header.order == ""
     needed = sum(
         e.count * sum(2 if ascii_ else np.dtype(kind).itemsize for kind in e.types.values()) for e in header.elements
@@ -129,18 +132,16 @@ def _check_size(header: PlyHeader) -> None:
     if available + ascii_ < needed or (available > needed and not open_ended):
         counts = ", ".join(f"{e.count} {e.name}" for e in header.elements)
         bound = "at least " if open_ended else ""
-        raise ValueError(
-            f"{header.path}: expected {bound}{needed} bytes of data after the header ({counts}), found {available}"
-        )
+        raise ValueError(f"expected {bound}{needed} bytes of data after the header ({counts}), found {available}")
 
 
 def read_into(header: PlyHeader, element: Element, columns: Sequence[tuple[str, np.ndarray]]) -> None:
-    """Fill arrays, one per named property, a few rows at a time: memory stays near what the caller keeps."""
+    """Fill one array per named property, a few rows at a time, which needs little memory besides the arrays."""
     before = header.elements[: header.elements.index(element)]
     if lists := [e.name for e in (*before, element) if e.has_lists]:
-        raise ValueError(f"{header.path}: expected single values before and in '{element.name}', found lists {lists}")
+        raise ValueError(f"expected single values before and in '{element.name}', found lists {lists}")
     rows = (_ascii_rows if header.order == "" else _binary_rows)(header, element, before)
-    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is culled as such
+    with np.errstate(over="ignore"):  # a double beyond float32 becomes infinite, and is culled
         for start in range(0, element.count, _ROWS_AT_ONCE):
             part = rows[start : start + _ROWS_AT_ONCE]
             for name, column in columns:
@@ -148,7 +149,7 @@ def read_into(header: PlyHeader, element: Element, columns: Sequence[tuple[str, 
 
 
 def read_columns(header: PlyHeader, element: Element, names: tuple[str, ...]) -> np.ndarray:
-    """The properties `names` as float32, (count, len(names))."""
+    """Read the properties `names` as float32, (count, len(names))."""
     out = np.empty((element.count, len(names)), np.float32)
     read_into(header, element, [(name, out[:, i]) for i, name in enumerate(names)])
     return out
@@ -168,12 +169,7 @@ def _ascii_rows(header: PlyHeader, element: Element, before: Sequence[Element]) 
     lines = header.path.read_bytes()[header.data_start :].splitlines()
     start, width = sum(e.count for e in before), len(element.types)
     words = b" ".join(lines[start : start + element.count]).split()
-    try:
-        values = np.array(words, np.float64).reshape(element.count, width)
-    except ValueError as error:
-        raise ValueError(
-            f"{header.path}: expected {width} numbers in each line of '{element.name}', found {str(error)[:80]}"
-        ) from None
+    values = np.array(words, np.float64).reshape(element.count, width)
     return np.ascontiguousarray(values).view([(name, "f8") for name in element.types])[:, 0]
 
 
@@ -182,7 +178,7 @@ def write_header(
     *elements: tuple[str, int, Sequence[tuple[str, str]]],
     metadata: SceneMetadata = SceneMetadata(),
 ) -> None:
-    """The header of a little-endian file of elements (name, number of rows, properties as (PLY type, name))."""
+    """Write the header of a little-endian file; elements are (name, number of rows, properties as (PLY type, name))."""
     lines = ["ply", "format binary_little_endian 1.0"]
     if metadata.up is not None:
         lines.append(f"comment up: {' '.join(f'{value:.6g}' for value in metadata.up)}")
@@ -197,27 +193,30 @@ def read_points(path: Path) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]
     """Read a coloured point cloud, or Gaussians as points with their mean colour.
 
     Returns:
-        Positions, and sRGB in [0, 1]: mid grey where the file has no colours.
+        Positions, and sRGB in [0, 1]; mid grey if the file has no colours.
     """
-    header = read_header(path)
-    vertex = header.element("vertex")
-    if vertex is None or not set(_POSITION) <= set(vertex.types):
-        found = [e.name for e in header.elements] if vertex is None else ", ".join(vertex.types)[:80]
-        raise ValueError(f"{path}: expected an element 'vertex' with x, y, z, found {found}")
+    with parsing(path):
+        return _points(read_header(path))
+
+
+def _points(header: PlyHeader) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
+    vertex = header.required("vertex")
+    if not set(_POSITION) <= set(vertex.types):
+        raise ValueError(f"expected the properties x, y, z, found {', '.join(vertex.types)[:80]}")
     names = next((trio for trio in (*_COLOR_NAMES, _DC) if set(trio) <= set(vertex.types)), ())
     table = torch.from_numpy(read_columns(header, vertex, (*_POSITION, *names)))
     points, colors = table[:, :3].contiguous(), table[:, 3:].contiguous()
     if not names:
-        colors = torch.full_like(points, _GREY)
+        colors = torch.full_like(points, 0.5)
     elif names == _DC:
         colors = spherical_harmonics.rgb_from_dc(colors).clamp(0, 1)
     elif (kind := vertex.types[names[0]])[0] != "f":
         colors = colors / np.iinfo(kind).max
     if not bool(torch.isfinite(points).all()):
         bad = int((~torch.isfinite(points).all(1)).sum())
-        raise ValueError(f"{path}: expected finite positions, found {bad} of {len(points)} points without")
+        raise ValueError(f"expected finite positions, found {bad} of {len(points)} points without")
     if not bool(((colors >= 0) & (colors <= 1)).all()):
-        raise ValueError(f"{path}: expected colours as bytes, or as floats in [0, 1], found others")
+        raise ValueError("expected colours as bytes, or as floats in [0, 1], found others")
     return points, colors
 
 

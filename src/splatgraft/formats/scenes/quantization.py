@@ -1,4 +1,4 @@
-"""Conversion between bytes and raw Gaussian fields, and the order of Gaussians, for the compressed scene formats."""
+"""Conversion between bytes and raw Gaussian fields, and the order of Gaussians, in compressed scene formats."""
 
 from pathlib import Path
 
@@ -10,21 +10,20 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 
 SMALLEST_SCALE = 1e-30
-"""World units; replaces a linear scale of exactly 0, since its logarithm is stored."""
-_MORTON_BITS = 10
+"""Linear scale, world units, that replaces 0, because its logarithm is stored."""
+_MORTON_BITS = 10  # per axis
 
 
 def from_linear(
-    path: Path,
     positions: Float[Tensor, "n 3"],
     scales: Float[Tensor, "n 3"],
     quaternions: Float[Tensor, "n 4"],
     rgba: UInt8[Tensor, "n 4"],
 ) -> Gaussians:
-    """Gaussians without bands of linear scales and bytes of sRGB and opacity, as .splat and .ksplat store them."""
+    """Make Gaussians of SH degree 0 from linear scales and bytes of sRGB and opacity, as in .splat and .ksplat."""
+    # a .splat has no signature that tells it from other files
     if not (positions.isfinite().all() and scales.isfinite().all() and (scales >= 0).all()):
-        kind = path.suffix
-        raise ValueError(f"{path}: expected finite positions and scales of 0 or more, found others: is this a {kind}?")
+        raise ValueError("expected finite positions and scales of 0 or more, found others: is it another format?")
     return Gaussians(
         means=positions,
         log_scales=scales.clamp_min(SMALLEST_SCALE).log(),
@@ -35,17 +34,17 @@ def from_linear(
 
 
 def logits_from_bytes(alphas: UInt8[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Opacity logits; 0 and 255 become a quarter step inside (0, 1), so that they stay finite and round back."""
+    """Convert bytes to opacity logits; 0 and 255 move a quarter step inwards, to stay finite and round back."""
     return (alphas.float().clamp(0.25, 254.75) / 255).logit()
 
 
 def bytes_from_unit(values: Float[Tensor, "*n"]) -> UInt8[Tensor, "*n"]:
-    """The nearest byte of values meant for [0, 1]; those outside saturate."""
+    """Round values in [0, 1] to bytes; others saturate."""
     return (values * 255).round().clamp(0, 255).to(torch.uint8)
 
 
 def smallest_three(quaternions: Float[Tensor, "n 4"]) -> tuple[Int64[Tensor, "n"], Float[Tensor, "n 3"]]:
-    """Index of the largest component of unit quaternions, and the other three, of the sign that makes it positive."""
+    """Split unit quaternions into the index of the largest component and the other three, with the largest positive."""
     unit = torch.nn.functional.normalize(quaternions, dim=1)
     largest = unit.abs().argmax(1, keepdim=True)
     unit = torch.where(unit.gather(1, largest) < 0, -unit, unit)
@@ -53,7 +52,7 @@ def smallest_three(quaternions: Float[Tensor, "n 4"]) -> tuple[Int64[Tensor, "n"
 
 
 def from_smallest_three(largest: Int64[Tensor, "n"], three: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """Quaternions from the index of their largest component and the other three; the inverse of `smallest_three`."""
+    """Join quaternions from the index of the largest component and the other three; inverts `smallest_three`."""
     largest = largest[:, None]
     out = torch.zeros(len(three), 4).scatter_(1, _others(largest), three)
     return out.scatter_(1, largest, (1 - three.square().sum(1, keepdim=True)).clamp_min(0).sqrt())
@@ -64,7 +63,7 @@ def _others(largest: Int64[Tensor, "n 1"]) -> Int64[Tensor, "n 3"]:
 
 
 def writable(path: Path, gaussians: Gaussians, *, least: int = 1) -> Gaussians:
-    """The Gaussians in float32 on the CPU, at least so many, all finite, as formats other than .ply need them."""
+    """Check that there are `least` Gaussians, all finite, and move them to the CPU as float32; .ply needs no check."""
     if gaussians.count < least:
         raise ValueError(f"{path}: expected at least one Gaussian for a {path.suffix} file, found none")
     fields = [gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.sh.flatten(1)]
@@ -78,9 +77,9 @@ def writable(path: Path, gaussians: Gaussians, *, least: int = 1) -> Gaussians:
 
 
 def morton_order(points: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
-    """Indices of `points` along a Morton curve, in which neighbours in a file are neighbours in space.
+    """Sort `points` along a Morton curve, so that neighbours in a file are neighbours in space; returns indices.
 
-    The curve goes through 1024 cells per axis whose bounds are quantiles, as scenes have a few points far away.
+    Each axis has 1024 cells, bounded by quantiles because scenes have a few points far away.
     """
     ranks = points.argsort(dim=0, stable=True).argsort(dim=0)
     cells = ranks * (1 << _MORTON_BITS) // max(1, len(points))

@@ -1,11 +1,10 @@
-"""Reads and writes SOG scenes (PlayCanvas, version 2): lossless pictures with one pixel per Gaussian, and meta.json.
+"""SOG scenes (PlayCanvas, version 2): lossless images with one pixel per Gaussian, and meta.json, in a zip or a folder.
 
-A .sog is a zip of these files; a folder of them is read as well. Positions are 16 bits of sign(x) log(1 + |x|), scales
-and colours are looked up in code books of 256 values, and bands above 0 are rows of a palette that is a picture too.
-Axes are those of a .ply. Written Gaussians are sorted along a Morton curve, so that neighbours compress well.
-
-Code books and palette are found by k-means (Lloyd 1982), the palette in two levels for speed: rows are first divided
-among coarse groups, then each group gets its share of the entries.
+- Positions are 16 bits of sign(x) log(1 + |x|).
+- Scales and colours index code books of 256 values, found by k-means (Lloyd 1982).
+- Bands above 0 index the rows of a palette, an image too. For speed, k-means finds it in two levels: rows are divided
+  among coarse groups, then each group gets its share of the entries.
+- Axes are those of a .ply. The writer sorts Gaussians along a Morton curve, so that neighbours compress well.
 """
 
 import io
@@ -34,34 +33,30 @@ from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata, state
 from splatgraft.runtime.files import atomic_write
 
 _META_FILE = "meta.json"
-_OWN_KEY = "splatgraft"  # where meta.json has the metadata of our own writer
-_SQRT2 = 2**0.5
-_FIRST_TAG = 252  # alpha of a quaternion whose largest component is w; x, y, z follow
-_PALETTE_COLUMNS = 64  # entries in a row of the palette's picture
+_OWN_KEY = "splatgraft"  # of the metadata in meta.json
+_FIRST_TAG = 252  # alpha of a quaternion whose largest component is w; 253 to 255 are x, y, z
+_PALETTE_COLUMNS = 64  # entries in a row of the palette's image
 _MIN_PALETTE, _MAX_PALETTE = 1 << 10, 1 << 16
-_GAUSSIANS_PER_ENTRY = 4  # gaussians that share an entry of the palette, chosen by size and PSNR of the demo's scenes
+_GAUSSIANS_PER_ENTRY = 4  # of the palette; chosen by size and PSNR of the demo's scenes
 _MAX_PIXELS_PER_BYTE = 100
-"""Largest picture that its bytes can hold: random bytes have 0.3, a scene of few different Gaussians 50; smaller
-pictures may have more."""
+"""Bound for images above `_FREE_PIXELS`: random bytes have 0.3, a scene of few different Gaussians 50."""
 _FREE_PIXELS = 1 << 20
-_MAX_META_BYTES = 1 << 24  # of meta.json, which has some 20 kB
-_MAX_EXPANSION = 10  # bytes of a file over those in the zip; pictures are compressed already
+_MAX_META_BYTES = 1 << 24  # of meta.json, which has about 20 kB
+_MAX_EXPANSION = 10  # bytes of a file over those in the zip; images are compressed already
 _FREE_BYTES = 1 << 20  # files below this size may expand further
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the others are unpacked whole, whatever size the zip states
-_MAX_LOG_POSITION = 60.0
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others are unpacked whole, beyond the size that the zip states
+_MAX_LOG_POSITION = 60.0  # beyond, float32 overflows soon
 _CODES = 256
-_SCALAR_ROUNDS = 100
+_SCALAR_ROUNDS = 100  # iterations of k-means for a code book
 _COARSE_GROUPS = 256
-_COARSE_SAMPLE = 1 << 15  # rows that the coarse groups are found from
-_ROUNDS = 5
-"""Rounds of k-means for the coarse groups and for the entries in each; more rounds changed the pictures of a demo by
-less than 0.1 dB."""
+_COARSE_SAMPLE = 1 << 15  # rows from which the coarse groups are found
+_ROUNDS = 5  # iterations of k-means for groups and entries; more changed the demo's renders by less than 0.1 dB
 _ROWS_AT_ONCE = 1 << 14
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def is_sog_folder(path: Path) -> bool:
-    """Whether `path` is a folder of SOG pictures, or its meta.json."""
+    """Whether `path` is a folder of SOG images, or its meta.json."""
     meta = path / _META_FILE if path.is_dir() else path
     if meta.name.lower() != _META_FILE or not meta.is_file():
         return False
@@ -73,34 +68,34 @@ def is_sog_folder(path: Path) -> bool:
 
 
 def sog_files(path: Path) -> tuple[Path, ...]:
-    """All files of a folder with meta.json, or of that meta.json."""
+    """List all files of a folder with meta.json; `path` is the folder or that file."""
     folder = path if path.is_dir() else path.parent
     return tuple(sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in (".json", ".webp", ".png")))
 
 
 def read_sog(path: Path) -> SceneFile:
-    """The scene in a .sog, or in a folder with meta.json and pictures, or of that meta.json."""
+    """Read a .sog, or a folder with meta.json and images; `path` may be that meta.json."""
     meta = json.loads(_load(path, _META_FILE))
     n = meta["count"]
     if meta["version"] != 2 or not 0 <= n < 1 << 28:
-        raise ValueError(f"{path}: expected SOG version 2, found version {meta['version']} of {n} Gaussians")
+        raise ValueError(f"expected SOG version 2, found version {meta['version']} of {n} Gaussians")
 
     def picture(key: str, index: int = 0) -> UInt8[np.ndarray, "h w 4"]:
         name = meta[key]["files"][index]
-        return _read_picture(path, name, _load(path, name))
+        return _read_picture(name, _load(path, name))
 
     def pixels(key: str, index: int = 0) -> UInt8[np.ndarray, "n 4"]:
         found = picture(key, index).reshape(-1, 4)
         if len(found) < n:
-            raise ValueError(f"{path}: expected pixels of {n} Gaussians in a picture of '{key}', found {len(found)}")
+            raise ValueError(f"expected pixels of {n} Gaussians in an image of '{key}', found {len(found)}")
         return found[:n]
 
     def codes(key: str) -> Float[np.ndarray, "256"]:
-        return _finite(path, meta[key]["codebook"], (_CODES,))
+        return _finite(meta[key]["codebook"], (_CODES,))
 
-    low, high = (_finite(path, meta["means"][end], (3,)) for end in ("mins", "maxs"))
+    low, high = (_finite(meta["means"][end], (3,)) for end in ("mins", "maxs"))
     if max(np.abs(low).max(), np.abs(high).max()) > _MAX_LOG_POSITION:
-        raise ValueError(f"{path}: expected logarithms of positions up to {_MAX_LOG_POSITION:g}, found larger bounds")
+        raise ValueError(f"expected logarithms of positions up to {_MAX_LOG_POSITION:g}, found larger bounds")
     fixed = pixels("means", 0)[:, :3].astype(np.float32) + 256 * pixels("means", 1)[:, :3].astype(np.float32)
     logarithm = low + (high - low) * (fixed / 65535)
     colors = pixels("sh0")
@@ -123,38 +118,38 @@ def read_sog(path: Path) -> SceneFile:
 
 
 def _load(path: Path, name: str) -> bytes:
-    """The bytes of a file of the scene."""
+    """Read a file of the scene."""
     if path.is_file() and path.name.lower() != _META_FILE:
         with zipfile.ZipFile(path) as archive, archive.open(name) as stream:
             entry = archive.getinfo(name)
             most = _MAX_META_BYTES if name == _META_FILE else _MAX_EXPANSION * entry.compress_size
             if entry.file_size > max(_FREE_BYTES, most) or entry.compress_type not in _METHODS:
                 found = f"{entry.file_size} bytes in {entry.compress_size}, method {entry.compress_type}"
-                raise ValueError(f"{path}: expected {name} of a scene, deflated or stored, found {found}")
-            # read() unpacks without regard to the size that the zip states
+                raise ValueError(f"expected {name} of a scene, deflated or stored, found {found}")
+            # read() without a size would unpack beyond the size that the zip states
             return stream.read(entry.file_size)
     if Path(name).name != name or "\\" in name:
-        raise ValueError(f"{path}: expected plain file names in {_META_FILE}, found {name[:60]!r}")
+        raise ValueError(f"expected plain file names in {_META_FILE}, found {name[:60]!r}")
     return ((path if path.is_dir() else path.parent) / name).read_bytes()
 
 
-def _read_picture(path: Path, name: str, data: bytes) -> UInt8[np.ndarray, "h w 4"]:
+def _read_picture(name: str, data: bytes) -> UInt8[np.ndarray, "h w 4"]:
     with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as image:
         if image.width * image.height > max(_FREE_PIXELS, _MAX_PIXELS_PER_BYTE * len(data)):
             found = f"{image.width} x {image.height} pixels in {len(data)} bytes"
-            raise ValueError(f"{path}: expected {name} to be as large as its bytes, found {found}")
+            raise ValueError(f"expected {name} to be as large as its bytes, found {found}")
         return np.asarray(image.convert("RGBA"))
 
 
-def _finite(path: Path, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _finite(values: Any, shape: tuple[int, ...]) -> np.ndarray:
     numbers = np.array(values, np.float64).astype(np.float32)
     if numbers.shape != shape or not np.isfinite(numbers).all():
-        raise ValueError(f"{path}: expected {shape[0]} finite numbers in {_META_FILE}, found others")
+        raise ValueError(f"expected {shape[0]} finite numbers in {_META_FILE}, found others")
     return numbers
 
 
 def _quaternions(pixels: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Three components besides the largest, in order w, x, y, z; other tags stand for no rotation."""
+    """Decode the three components besides the largest, in order w, x, y, z; other tags mean no rotation."""
     three = (pixels[:, :3].astype(np.float32) / 255 * 2 - 1) * np.float32(0.5**0.5)
     largest = pixels[:, 3:].astype(np.int64) - _FIRST_TAG
     three, largest = np.where(largest >= 0, three, 0), np.maximum(largest, 0)
@@ -165,13 +160,13 @@ def _quaternions(pixels: UInt8[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
 
 
 def write_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> None:
-    """Write positions in 16 bits of their logarithm, scales and colours by tables, bands by a palette."""
+    """Write positions as 16 bits of their logarithm, scales and colours by code books, bands by a palette."""
     with atomic_write(path) as stream:
         stream.write(encode_sog(path, gaussians, metadata))
 
 
 def encode_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = SceneMetadata()) -> bytes:
-    """The bytes of a .sog; `path` is for messages."""
+    """Encode a .sog; `path` is for messages."""
     g = writable(path, gaussians)
     g = g.select(morton_order(g.means))
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "splatgraft"}, "count": g.count, "antialias": False}
@@ -193,7 +188,7 @@ def encode_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = Scene
     add("scales", {"scales.webp": _picture(nearest_codes(scales, codes))}, codebook=codes.tolist())
 
     largest, three = smallest_three(g.quaternions)
-    three_bytes = bytes_from_unit(three * _SQRT2 / 2 + 0.5)
+    three_bytes = bytes_from_unit(three * 2**0.5 / 2 + 0.5)
     add("quats", {"quats.webp": _picture(three_bytes.numpy(), (largest + _FIRST_TAG).numpy())})
 
     dc = g.sh[:, 0].numpy()
@@ -224,7 +219,7 @@ def encode_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = Scene
 
 
 def _picture(rgb: np.ndarray, alpha: np.ndarray | int = 255, *, width: int | None = None) -> bytes:
-    """Pixels (n 3) in rows as lossless WebP; about square, with sides of multiples of four, where no width is given."""
+    """Encode pixels (n 3) in rows as lossless WebP; without `width` about square, with sides of multiples of four."""
     width = width or 4 * math.ceil(math.sqrt(len(rgb)) / 4)
     height = -(-len(rgb) // width)
     full = np.zeros((height * width, 4), np.uint8)
@@ -236,7 +231,7 @@ def _picture(rgb: np.ndarray, alpha: np.ndarray | int = 255, *, width: int | Non
 
 
 def scalar_codes(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
-    """256 ascending numbers that represent `values` with a small squared error; the last repeated where fewer do."""
+    """Fit 256 ascending codes to `values` with a small squared error; of fewer distinct values the last is repeated."""
     ordered = np.sort(values.astype(np.float64))
     distinct = np.unique(ordered)
     if len(distinct) <= _CODES:
@@ -253,12 +248,12 @@ def scalar_codes(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
 
 
 def nearest_codes(values: Float[np.ndarray, "*shape"], codes: Float[np.ndarray, "256"]) -> UInt8[np.ndarray, "*shape"]:
-    """Index of the code nearest to each value; codes ascend."""
+    """Find the index of the nearest code, for ascending codes."""
     return np.searchsorted((codes[1:] + codes[:-1]) / 2, values).astype(np.uint8)
 
 
 def palette(rows: Float[Tensor, "n f"], size: int) -> tuple[Float[Tensor, "p f"], Int64[Tensor, "n"]]:
-    """At most `size` rows that represent all, and which of them represents each row; all where they are no more."""
+    """Fit at most `size` rows that represent all; returns them and the index of each row's entry."""
     n = len(rows)
     if n <= size:
         return rows, torch.arange(n)
@@ -271,7 +266,7 @@ def palette(rows: Float[Tensor, "n f"], size: int) -> tuple[Float[Tensor, "p f"]
         if not len(chosen):
             continue
         own = rows[chosen]
-        # rounded down, and at least one: no more than `size` in all, as groups are no more than entries
+        # rounded down, but at least one; at most `size` in all, because there are at most as many groups
         share = max(1, int(len(chosen) / n * (size - len(members))))
         means = k_means(own, own[_spread(len(own), share)], rounds=_ROUNDS)
         entries.append(means)
@@ -281,7 +276,7 @@ def palette(rows: Float[Tensor, "n f"], size: int) -> tuple[Float[Tensor, "p f"]
 
 
 def _spread(n: int, count: int) -> Int64[Tensor, "count"]:
-    """`count` of n indices, evenly spaced."""
+    """Select `count` of n indices, evenly spaced."""
     return (torch.arange(count) * n) // count
 
 

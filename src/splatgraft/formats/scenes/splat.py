@@ -1,4 +1,4 @@
-"""Reads and writes .splat scenes: 32 bytes per Gaussian, colour without view dependence.
+""".splat scenes: 32 bytes per Gaussian, colour without view dependence.
 
 Layout (antimatter15/splat): position 3 x float32, scale 3 x float32, colour and opacity 4 x uint8,
 quaternion wxyz 4 x uint8 as 128 + 128 q.
@@ -19,18 +19,18 @@ _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4),
 
 
 def read_splat(path: Path) -> SceneFile:
-    """The scene in a .splat file, SH degree 0."""
+    """Read a .splat file; SH degree 0."""
     data = path.read_bytes()
     if not data or len(data) % _ROW.itemsize:
-        raise ValueError(f"{path}: expected a multiple of {_ROW.itemsize} bytes above 0, found {len(data)}")
+        raise ValueError(f"expected a multiple of {_ROW.itemsize} bytes above 0, found {len(data)}")
     rows = {name: torch.from_numpy(np.frombuffer(data, _ROW)[name].copy()) for name in _ROW.names or ()}
     quaternions = (rows["quaternion"].float() - 128) / 128
-    gaussians = from_linear(path, rows["position"], rows["scale"], quaternions, rows["rgba"])
+    gaussians = from_linear(rows["position"], rows["scale"], quaternions, rows["rgba"])
     return SceneFile(gaussians, notes=("the format has colours without view dependence",))
 
 
 def write_splat(path: Path, gaussians: Gaussians, _: SceneMetadata = SceneMetadata()) -> None:
-    """Write positions and scales exactly, the rest in 8 bits; bands above 0 are lost, as the format has none."""
+    """Write positions and scales exactly, the rest in 8 bits; bands above 0 are lost."""
     g = writable(path, gaussians)
     rows = np.empty(g.count, _ROW)
     rows["position"] = g.means.numpy()

@@ -1,4 +1,4 @@
-"""Reads .spz scenes (Niantic, versions 2 to 4) and writes versions 3 and 4: quantised arrays, one per field.
+""".spz scenes (Niantic; reads versions 2 to 4, writes 3 and 4): quantised arrays, one per field.
 
 Layout of Niantic's load-spz.cc: a header, then the arrays; in one gzip stream (versions 2 and 3), or plain with a table
 of sizes and one zstd stream per array (version 4). Axes are right-up-back, ours and a .ply's are right-down-front.
@@ -27,24 +27,24 @@ from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
 from splatgraft.runtime.files import atomic_write
 
 AXES = "RUB"
-"""Right, up, back."""
+"""Axes of the file: right, up, back."""
 _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
-"""Magic number, version, Gaussians, SH degree, fractional bits of positions, flags; number of streams in version 4."""
+"""Magic number, version, Gaussians, SH degree, fractional bits of positions, flags, streams (version 4)."""
 _TABLE_START = struct.Struct("<I12x")
 _TABLE_ENTRY = struct.Struct("<QQ")
 _ANTIALIASED = 1
-_GZIP = 31
+_GZIP = 31  # window bits of zlib for a gzip stream
 _ZSTD_LEVEL = 12  # the level of the format's own library
 _MAX_EXPANSION = 100
-"""Bytes of the arrays over compressed ones; files of trained scenes have about 2, a few repeated Gaussians 50."""
+"""Largest ratio of the arrays' bytes to compressed ones: trained scenes have about 2, repeated Gaussians 50."""
 _FREE_BYTES = 1 << 20  # arrays below this size may expand further
 _COLOR_SCALE = 0.15
 _HALF_SQRT2 = 0.5**0.5
 
 
 def read_spz(path: Path) -> SceneFile:
-    """The scene in a .spz file."""
+    """Read a .spz file."""
     data = path.read_bytes()
     packed = data[:4] == struct.pack("<I", _MAGIC)
     inflate = zlib.decompressobj(_GZIP)
@@ -52,20 +52,20 @@ def read_spz(path: Path) -> SceneFile:
     magic, version, n, degree, bits, flags, streams = _HEADER.unpack(head)
     if magic != _MAGIC or version not in ((4,) if packed else (2, 3)) or degree > 3 or bits > 24:
         raise ValueError(
-            f"{path}: expected a .spz of version 2 to 4 with SH degree up to 3, "
+            "expected a .spz of version 2 to 4 with SH degree up to 3, "
             f"found magic {magic:#x}, version {version}, degree {degree}, {bits} bits"
         )
     widths = (9, 1, 3, 3, 4 if version >= 3 else 3, 3 * ((degree + 1) ** 2 - 1))
     sizes = [n * width for width in widths]
     if sum(sizes) > max(_FREE_BYTES, _MAX_EXPANSION * len(data)):
-        raise ValueError(f"{path}: expected {n} Gaussians as the header says, found only {len(data)} compressed bytes")
+        raise ValueError(f"expected {n} Gaussians as the header says, found only {len(data)} compressed bytes")
     if packed:
         arrays = _zstd_arrays(path, data, streams, sizes)
     else:
-        body = inflate.decompress(inflate.unconsumed_tail, sum(sizes) + _FREE_BYTES)  # extensions may follow
+        body = inflate.decompress(inflate.unconsumed_tail, sum(sizes) + _FREE_BYTES)  # extensions may follow the arrays
         arrays = [body[end - size : end] for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
-        if not inflate.eof:  # neither is its checksum compared
-            raise ValueError(f"{path}: expected {n} Gaussians in one gzip stream, found a cut one, or more")
+        if not inflate.eof:  # zlib has not compared its checksum
+            raise ValueError(f"expected {n} Gaussians in one gzip stream, found a cut one, or more")
     fields = [np.frombuffer(array, np.uint8).reshape(n, width) for array, width in zip(arrays, widths, strict=True)]
     positions, alphas, colors, scales, rotations, bands = (torch.from_numpy(field.copy()) for field in fields)
     bands = (bands.reshape(n, widths[5] // 3, 3).float() - 128) / 128
@@ -81,7 +81,7 @@ def read_spz(path: Path) -> SceneFile:
 
 
 def _zstd_arrays(path: Path, data: bytes, streams: int, sizes: list[int]) -> list[bytes]:
-    """Version 4: after the table, one zstd stream per array that is not empty."""
+    """Decompress version 4: a table of sizes, then one zstd stream per array that is not empty."""
     zstandard = _zstandard(path)
     (table,) = _TABLE_START.unpack_from(data, _HEADER.size)
     start, arrays = table + streams * _TABLE_ENTRY.size, []
@@ -92,11 +92,11 @@ def _zstd_arrays(path: Path, data: bytes, streams: int, sizes: list[int]) -> lis
         length, _ = _TABLE_ENTRY.unpack_from(data, table)
         stream = data[start : start + length]
         if zstandard.frame_content_size(stream) not in (size, -1):
-            raise ValueError(f"{path}: expected a zstd stream of {size} bytes, found another size in its header")
+            raise ValueError(f"expected a zstd stream of {size} bytes, found another size in its header")
         arrays.append(zstandard.ZstdDecompressor(max_window_size=1 << 27).decompress(stream, max_output_size=size))
         table, start = table + _TABLE_ENTRY.size, start + length
     if start != len(data):
-        raise ValueError(f"{path}: expected the end of the file after its streams, found {len(data) - start} bytes")
+        raise ValueError(f"expected the end of the file after its streams, found {len(data) - start} bytes")
     return arrays
 
 
@@ -112,20 +112,20 @@ def _zstandard(path: Path) -> Any:
 
 
 def _means(positions: UInt8[Tensor, "n 9"], fractional_bits: int) -> Float[Tensor, "n 3"]:
-    """24-bit signed fixed point."""
+    """Decode 24-bit signed fixed point."""
     low, middle, high = positions.reshape(-1, 3, 3).int().unbind(-1)
     fixed = low | middle << 8 | high << 16
     return torch.where(fixed >= 1 << 23, fixed - (1 << 24), fixed).float() / (1 << fractional_bits)
 
 
 def _three_bytes_unpacked(rotations: UInt8[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """x, y, z of a unit quaternion with w >= 0."""
+    """Decode x, y, z of a unit quaternion with w >= 0."""
     xyz = rotations.float() / 127.5 - 1
     return torch.cat([(1 - xyz.square().sum(1, keepdim=True)).clamp_min(0).sqrt(), xyz], 1)
 
 
 def _four_bytes_unpacked(rotations: UInt8[Tensor, "n 4"]) -> Float[Tensor, "n 4"]:
-    """Index of the largest of x, y, z, w in two bits, then the others in order: sign and 9 bits each."""
+    """Decode the index of the largest of x, y, z, w in two bits, then the others in order: sign and 9 bits each."""
     packed = torch.from_numpy(rotations.numpy().view("<u4")[:, 0].astype(np.int64))
     three = packed[:, None] >> torch.tensor([20, 10, 0]) & 0x3FF
     values = (three & 0x1FF).float() / 0x1FF * _HALF_SQRT2 * torch.where(three >> 9 == 1, -1.0, 1.0)
