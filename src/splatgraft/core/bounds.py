@@ -9,9 +9,7 @@ from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
 
-_OPAQUE = 0.1  # opacity above which a Gaussian counts
-_STRAY = 0.01  # share of Gaussians on either side that may lie outside
-_MARGIN = 1.05  # factor on the radius; the three are set by hand
+_STRAY = 0.01  # share of Gaussians on either side that may lie outside; like the others below, set by hand
 
 
 @dataclass(frozen=True)
@@ -30,7 +28,7 @@ def bounding_sphere(gaussians: Gaussians) -> BoundingSphere:
     Its centre is the middle between the 1st and the 99th percentile along each axis. Gaussians below an opacity of 0.1
     are ignored, unless all are.
     """
-    opaque = gaussians.opacities > _OPAQUE
+    opaque = gaussians.opacities > 0.1
     means = gaussians.means[opaque] if bool(opaque.any()) else gaussians.means
     scales = (gaussians.scales[opaque] if bool(opaque.any()) else gaussians.scales).max(1).values
     # a partition is faster than a quantile's sort; the editor computes this after every move
@@ -38,4 +36,4 @@ def bounding_sphere(gaussians: Gaussians) -> BoundingSphere:
     partitioned = torch.from_numpy(np.partition(means.numpy(), (low, high), axis=0))
     center = 0.5 * (partitioned[low] + partitioned[high])
     reach = (means - center).norm(dim=1) + scales
-    return BoundingSphere(center=center, radius=_MARGIN * float(np.partition(reach.numpy(), high)[high]))
+    return BoundingSphere(center=center, radius=1.05 * float(np.partition(reach.numpy(), high)[high]))

@@ -8,8 +8,6 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-_EDGE_SAMPLES = 129  # points on each edge of the image
-
 
 @dataclass(frozen=True)
 class Distortion:
@@ -28,7 +26,7 @@ class Distortion:
         Raises: ValueError if the distortion folds the image over itself.
         """
         width, height = self.size
-        t = np.linspace(0, 1, _EDGE_SAMPLES)
+        t = np.linspace(0, 1, 129)  # points on each edge
         zero, one = np.zeros_like(t), np.ones_like(t)
         edges = np.stack([[zero, t], [one, t], [t, zero], [t, one]]).transpose(0, 2, 1)  # left, right, top, bottom
         edges_px = (edges * (width, height)).reshape(-1, 1, 2)

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from statistics import median
 
 _SATURATION_CD_M2 = 78 / (100 * 0.65)  # luminance of white at EV 0 and ISO 100
-_EV_OF_BRIGHTNESS_0 = 5.0  # APEX: the speed value of ISO 100
-_GAMMA = 2.2
 MAX_STOPS = 0.4
 """Largest range of exposures, stops, in a capture whose settings count as equal: one step of a camera's dial. This is a
 third of a stop, up to 0.36 by the rounded numbers on the dial (1/160 s and 1/125 s)."""
@@ -43,7 +41,7 @@ class Exposure:
         if self.shutter_s is not None and self.aperture is not None and self.iso is not None:
             return math.log2(self.aperture**2 / self.shutter_s) - math.log2(self.iso / 100)
         if self.brightness_stops is not None:
-            return self.brightness_stops + _EV_OF_BRIGHTNESS_0 - (self.bias_stops or 0.0)
+            return self.brightness_stops + 5.0 - (self.bias_stops or 0.0)  # APEX: 5 is the speed value of ISO 100
         return None
 
     def __str__(self) -> str:
@@ -62,7 +60,7 @@ def relative_gains(exposures: Sequence[Exposure]) -> list[float]:
     """
     stops = [one.ev100 for one in exposures if one.ev100 is not None]
     middle = sum(stops) / max(len(stops), 1)
-    gains = [1.0 if one.ev100 is None else 2 ** ((middle - one.ev100) / _GAMMA) for one in exposures]
+    gains = [1.0 if one.ev100 is None else 2 ** ((middle - one.ev100) / 2.2) for one in exposures]
     return [gain * len(gains) / sum(gains) for gain in gains]
 
 

@@ -20,9 +20,6 @@ _SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)
 """Contrast sensitivity of the achromatic, red-green and blue-yellow channel, as sums of Gaussians (a, b):
 a sqrt(pi / b) exp(-pi^2 x^2 / b), x in degrees (Table 1)."""
 _COLOR_EXPONENT = 0.7  # q_c, compresses large colour differences (Sec. 4.1.4).
-_KNEE = (0.4, 0.95)  # p_c and p_t: differences up to p_c of the largest are spread over [0, p_t] (Sec. 4.1.4).
-_FEATURE_WIDTH_DEGREES = 0.082  # w, from peak to trough of the edge detector (Sec. 4.2.1).
-_FEATURE_EXPONENT = 0.5  # q_f (Sec. 4.2.2).
 VERSION = "LDR-FLIP 2020, own implementation, 67.02 pixels per degree"
 """Implementation and viewing conditions, recorded beside each value."""
 
@@ -48,7 +45,7 @@ def flip_map(image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"]) -
     color = _spread(_hyab(seen[0], seen[1]) ** _COLOR_EXPONENT)
     found = [_features((x[..., 0] + 16) / 116) for x in both]
     feature = torch.maximum(*((a - b).abs() for a, b in zip(*found, strict=True)))
-    feature = (feature / math.sqrt(2)) ** _FEATURE_EXPONENT
+    feature = (feature / math.sqrt(2)) ** 0.5  # q_f (Sec. 4.2.2)
     return (color ** (1 - feature)).to(image)
 
 
@@ -114,7 +111,7 @@ def _spread(powered: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Map colour differences to [0, 1]; the largest is between green and blue."""
     primaries = _hunt(_lab(torch.eye(3, dtype=powered.dtype, device=powered.device)[None, 1:]))[0]
     largest = float(_hyab(primaries[0], primaries[1])) ** _COLOR_EXPONENT
-    part, top = _KNEE
+    part, top = 0.4, 0.95  # p_c and p_t: differences up to p_c of the largest are spread over [0, p_t] (Sec. 4.1.4)
     knee = part * largest
     above = top + (powered - knee) / (largest - knee) * (1 - top)
     return torch.where(powered < knee, powered * top / knee, above)
@@ -122,7 +119,7 @@ def _spread(powered: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 
 def _features(luminance: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Compute the strength of edges and of points, by first and second derivatives of a Gaussian."""
-    deviation = 0.5 * _FEATURE_WIDTH_DEGREES * _PIXELS_PER_DEGREE
+    deviation = 0.5 * 0.082 * _PIXELS_PER_DEGREE  # w, degrees from peak to trough of the edge detector (Sec. 4.2.1)
     radius = math.ceil(3 * deviation)
     x = torch.arange(-radius, radius + 1, dtype=luminance.dtype, device=luminance.device)
     gaussian = torch.exp(-(x**2) / (2 * deviation**2))

@@ -11,10 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_TRIALS = 2000  # random planes tried
-_REFINEMENTS = 3  # least-squares fits, each to the inliers of the one before
-_MIN_POINTS = 50  # fewer points give no plane
-
 
 @dataclass(frozen=True)
 class LevelPlaneOptions:
@@ -63,10 +59,10 @@ def dominant_level_plane(
 ) -> LevelPlane | None:
     """Find the largest nearly level plane among sparse surface points; None if no plane is level and large enough."""
     x, upward = points.double(), up.double()
-    if len(x) < _MIN_POINTS:
+    if len(x) < 50:
         return None
     threshold = options.thickness * (x - x.median(0).values).norm(dim=1).median()
-    normals, on_plane = sample_planes(x, _TRIALS, seed=0)
+    normals, on_plane = sample_planes(x, 2000, seed=0)
     normals = torch.nn.functional.normalize(normals, dim=1)
     normals = normals * torch.sign(normals @ upward)[:, None]
     level = normals @ upward > math.cos(math.radians(options.tilt_deg))
@@ -75,7 +71,7 @@ def dominant_level_plane(
     normals, offsets = normals[level], (normals[level] * on_plane[level]).sum(1)
     counts = torch.stack([((x @ n - d).abs() < threshold).sum() for n, d in zip(normals, offsets, strict=True)])
     normal, offset = normals[counts.argmax()], offsets[counts.argmax()]
-    for _ in range(_REFINEMENTS):
+    for _ in range(3):  # least-squares fits, each to the inliers of the one before
         inliers = x[(x @ normal - offset).abs() < threshold]
         if len(inliers) < options.inlier_share * len(x):
             return None

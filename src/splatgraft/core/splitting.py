@@ -68,10 +68,8 @@ def _pieces_by_opacity(opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 6"]:
 
 # which Gaussians around an object are split; set by hand on the benchmark scenes
 _MIN_WIDTH = 0.25  # minimum standard deviation along the widest axis, object radii
-_MIN_OPACITY = 0.02  # fainter Gaussians are not split
 _REACH = 1.5  # largest distance of a centre from the object's, object radii, plus two standard deviations
 _FARTHEST = 6.0  # largest distance of any centre, object radii
-_ROUNDS = 6  # maximum number of splits of a Gaussian and its pieces
 _MAX_PER_ROUND = 4000
 """Maximum number of Gaussians split per round and object; a scene of a million small Gaussians has none that wide."""
 
@@ -91,11 +89,11 @@ def split_wide_around(
         middle = 0.5 * (one.means.quantile(0.01, dim=0) + one.means.quantile(0.99, dim=0))
         radius = float((one.means - middle).norm(dim=1).quantile(0.99))
         farthest = torch.tensor(_FARTHEST * radius, device=gaussians.device)
-        for _ in range(_ROUNDS):
+        for _ in range(6):  # pieces that are still too wide are split again
             widest, axis = gaussians.scales.max(1)
             away = (gaussians.means - middle).norm(dim=1)
             near = away < torch.minimum(_REACH * radius + 2 * widest, farthest)
-            wide = (widest > _MIN_WIDTH * radius) & (gaussians.opacities > _MIN_OPACITY)
+            wide = (widest > _MIN_WIDTH * radius) & (gaussians.opacities > 0.02)
             score = widest * (~is_object & near & wide)
             if not bool((score > 0).any()):
                 break

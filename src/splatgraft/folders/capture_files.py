@@ -12,8 +12,6 @@ from splatgraft.formats.captures.exif import read_exposure
 from splatgraft.runtime.note import Note
 
 _NAMED = 8  # maximum number of images that a message names
-_PLENTY = 40  # kept photos above which left-out ones are no warning
-_FEW = 4  # kept photos per left-out one above which that is no warning; set by hand
 
 
 def has_poses(path: Path) -> bool:
@@ -77,7 +75,8 @@ def left_out_notes(path: Path, kept: int, left_out: Sequence[LeftOut]) -> list[N
         f"left out: {reasons[0]}" + (f" (and {len(reasons) - 1} more like it)" if len(reasons) > 1 else "")
         for reasons in by_kind.values()
     ]
-    level = "minor" if _FEW * len(left_out) <= kept or kept >= _PLENTY else "warning"
+    # four kept photos per left-out one, or forty, leave enough; set by hand
+    level = "minor" if 4 * len(left_out) <= kept or kept >= 40 else "warning"
     return [Note(head, level), *(Note(line) for line in lines[:_NAMED])]
 
 

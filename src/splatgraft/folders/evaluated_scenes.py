@@ -22,10 +22,7 @@ from splatgraft.project.layout import CAMERAS_FILE, IS_OBJECT_FILE, SCENE_FILE
 from splatgraft.rendering import render
 from splatgraft.runtime.lazy_sequence import LazySequence
 
-_CUT_OBJECT = 0.05  # factor on the prominence of an object that the image border cuts; set by hand
-_GUESSED_POWER = 4  # of the photographed share: 0.8 counts 0.4; set by hand
-_LOOK_PX = 160  # longest side of the views among which the best is sought
-_LOOKED_AT = 40  # maximum number of these views
+_LOOKED_AT = 40  # maximum number of views among which the best is sought
 
 
 @dataclass(frozen=True)
@@ -110,7 +107,7 @@ class EvaluatedScenes:
     @property
     def best_view(self) -> int:
         """Index of the camera with the largest `Pictures.prominence`, among at most `_LOOKED_AT`."""
-        small = self.cameras.resized(min(1.0, _LOOK_PX / int(self.cameras.sizes.max())))
+        small = self.cameras.resized(min(1.0, 160 / int(self.cameras.sizes.max())))
         every = math.ceil(len(small) / _LOOKED_AT)
         return max(range(0, len(small), every), key=lambda index: _prominence(*self._object_from(small[index])))
 
@@ -136,8 +133,9 @@ class EvaluatedScenes:
 
 def _prominence(mask: Float[Tensor, "h w"], guessed_share: float) -> float:
     rim = torch.cat([mask[0], mask[-1], mask[:, 0], mask[:, -1]])
-    cut = _CUT_OBJECT if bool((rim > 0.5).any()) else 1.0
-    return float(mask.sum()) * (1 - guessed_share) ** _GUESSED_POWER * cut
+    cut = 0.05 if bool((rim > 0.5).any()) else 1.0
+    # set by hand: a photographed share of 0.8 counts 0.4
+    return float(mask.sum()) * (1 - guessed_share) ** 4 * cut
 
 
 @dataclass(frozen=True)

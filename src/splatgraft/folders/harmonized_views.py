@@ -26,7 +26,6 @@ from splatgraft.runtime.workers import Task, run_tasks
 _READERS, _WRITERS = 1, 2
 """Threads that decode and encode images beside the model; one thread takes about 0.09 s per view of 704x496."""
 _WAITING_VIEWS = 2  # maximum number of views that wait to be written
-_POLL_SECONDS = 0.5
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ def harmonize_with_processes(whole: Part, processes: int, *, say: Callable[[str]
     with ProcessPoolExecutor(processes, get_context("spawn"), torch.set_num_threads, (threads,)) as pool:
         try:
             running = [pool.submit(harmonize_part, part) for part in parts]
-            while wait(running, _POLL_SECONDS).not_done:
+            while wait(running, timeout=0.5).not_done:
                 progress(len(finished(whole.kept, views)), len(views), f"{processes} processes")
             counts = [one.result() for one in running]
         except BrokenProcessPool as error:

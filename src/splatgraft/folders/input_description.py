@@ -13,7 +13,6 @@ from splatgraft.formats.captures.photo_archive import count_archived_photos, is_
 from splatgraft.project.layout import PROJECT_FILE, SCENE_FILE
 
 InputKind = Literal["photos", "video", "posed capture", "scene", "project", "nothing"]
-_LARGE = 1 << 30  # bytes above which a scene's Gaussians are not counted
 _FOLDERS = (f"target/scene/{SCENE_FILE}", f"result/{SCENE_FILE}", SCENE_FILE)
 """Scenes in folders of results."""
 
@@ -58,7 +57,7 @@ def _described(path: Path) -> InputDescription:
         return InputDescription("project", f"a project of its own: splatgraft edit {folder}")
     if is_scene(path):
         size = sum(p.stat().st_size for p in ([path] if path.is_file() else path.iterdir()) if p.is_file())
-        count = "" if size > _LARGE else f" of {read_gaussians(path).count:,} Gaussians"
+        count = "" if size > 1 << 30 else f" of {read_gaussians(path).count:,} Gaussians"
         return InputDescription("scene", f"a trained scene{count}: images are rendered from it, nothing is trained")
     if has_poses(path):
         posed = read_capture(path)

@@ -22,8 +22,6 @@ from splatgraft.segmentation import ObjectRegion
 MaskSource = Literal["auto", "files", "grabcut", "sam2", "birefnet", "box"]
 """Origin of the masks for `segment`."""
 
-_CELL_PX = 320  # longest side of a photograph on the sheet
-_COLUMNS = 4
 _MASK_RED, _SELECTION_BLUE = (255, 60, 40), (60, 220, 255)
 
 
@@ -91,7 +89,7 @@ def write_mask_sheet(
     cells = [_cell(masked, index, scene, selection) for index in chosen]
     height, width = max(c.shape[0] for c in cells), max(c.shape[1] for c in cells)
     padded = [torch.nn.functional.pad(c, (0, 0, 0, width - c.shape[1], 0, height - c.shape[0]), value=1) for c in cells]
-    columns = min(_COLUMNS, len(padded))
+    columns = min(4, len(padded))
     padded += [torch.ones(height, width, 3)] * (-len(padded) % columns)
     rows = [torch.cat(padded[i : i + columns], 1) for i in range(0, len(padded), columns)]
     write_image(path, torch.cat(rows))
@@ -99,7 +97,7 @@ def write_mask_sheet(
 
 def _cell(masked: MaskedViews, index: int, scene: Gaussians, selection: Bool[Tensor, "n"]) -> Float[Tensor, "h w 3"]:
     camera = masked.views.cameras[index]
-    small = camera.resized(min(1.0, _CELL_PX / int(camera.sizes.max())))
+    small = camera.resized(min(1.0, 320 / int(camera.sizes.max())))
     image = (resize(masked.views.image(index), small.width, small.height).clamp(0, 1) * 255).to(torch.uint8).numpy()
     mask = resize(masked.masks[index], small.width, small.height) > 0.5
     feature = selection[:, None].float().to(scene.device)

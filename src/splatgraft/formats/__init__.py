@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
@@ -61,8 +60,6 @@ _WRITERS = {
     ".glb": write_gaussian_glb,
 }
 
-_COEFFICIENTS = tuple(spherical_harmonics.coefficient_count(d) for d in range(spherical_harmonics.MAX_DEGREE + 1))
-
 SCENE_SUFFIXES = tuple(_READERS)
 """Suffixes of trained scenes that can be read; a folder of SOG images has none."""
 
@@ -112,7 +109,7 @@ def _read(path: Path) -> SceneFile:
             raise ValueError("expected a trained scene, found none")
         scene = read(path)
         shapes = [tuple(field.shape) for field in vars(scene.gaussians).values()]
-        if len({shape[0] for shape in shapes}) > 1 or shapes[-1][1] not in _COEFFICIENTS:
+        if len({shape[0] for shape in shapes}) > 1 or shapes[-1][1] not in (1, 4, 9, 16):
             raise ValueError(f"expected fields of one length, and 1, 4, 9 or 16 SH coefficients, found {shapes}")
     return scene
 

@@ -12,7 +12,6 @@ from PIL.TiffImagePlugin import IFDRational
 from splatgraft.core.exposure import Exposure
 from splatgraft.core.images import read_exif
 
-_MAX_ISO = 65535  # the tag has 16 bits
 _AUTO, _MANUAL = 0, 1
 """Values of the tag WhiteBalance."""
 _MAX_STOPS = 40.0  # largest APEX value; cameras write about 100 for unknown ones
@@ -49,7 +48,7 @@ def exif_of(exposure: Exposure) -> Image.Exif:
             fraction = Fraction(value).limit_denominator(1_000_000)
             tags[tag] = IFDRational(fraction.numerator, fraction.denominator)
     if exposure.iso is not None:
-        tags[Base.ISOSpeedRatings] = min(round(exposure.iso), _MAX_ISO)
+        tags[Base.ISOSpeedRatings] = min(round(exposure.iso), 65535)  # the tag has 16 bits
     if exposure.auto_white_balance is not None:
         tags[Base.WhiteBalance] = _AUTO if exposure.auto_white_balance else _MANUAL
     return exif

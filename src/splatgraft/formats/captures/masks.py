@@ -12,7 +12,6 @@ PHOTO_FOLDERS = ("images", "photos", "input", "rgb")
 _MASK_FOLDERS = ("masks", "mask")
 _MASK_ENDINGS = ("_mask", ".mask")
 """Ending of a mask's stem beside its photo: defaults of Metashape and of RealityCapture."""
-_ALPHA_SAMPLES = 8  # files decoded to decide whether alpha channels are masks
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def _alpha_masks(paths: list[Path]) -> dict[Path, Path]:
             return False
 
     transparent = [path for path in paths if holds(has_transparency, path)]
-    sample = transparent[:: max(1, len(transparent) // _ALPHA_SAMPLES)]
+    sample = transparent[:: max(1, len(transparent) // 8)]
     varies = any(holds(lambda one: bool((read_alpha(one) < 1).any()), path) for path in sample)
     return {path: path for path in transparent} if varies else {}
 

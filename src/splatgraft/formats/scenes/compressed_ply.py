@@ -15,6 +15,7 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes import ply
 from splatgraft.formats.scenes.quantization import (
+    HALF_SQRT2,
     from_smallest_three,
     logits_from_bytes,
     morton_order,
@@ -30,7 +31,6 @@ _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _BOUNDS = ("{}_x {}_y {}_z", "{}_scale_x {}_scale_y {}_scale_z", "{}_r {}_g {}_b")
 _POSITION_BITS = (11, 10, 11)
 _LARGEST_LOG_SCALE = 20.0
-_HALF_SQRT2 = 0.5**0.5
 
 
 def is_compressed(vertex: ply.Element) -> bool:
@@ -59,7 +59,7 @@ def read_compressed_ply(header: ply.PlyHeader) -> Gaussians:
     return Gaussians(
         means=between(_BOUNDS[0], _unpacked(position, _POSITION_BITS)),
         log_scales=between(_BOUNDS[1], _unpacked(scale, _POSITION_BITS)),
-        quaternions=from_smallest_three(rotation >> 30, (_unpacked(rotation, (10, 10, 10)) - 0.5) / _HALF_SQRT2),
+        quaternions=from_smallest_three(rotation >> 30, (_unpacked(rotation, (10, 10, 10)) - 0.5) / HALF_SQRT2),
         opacity_logits=logits_from_bytes((color & 255).to(torch.uint8)),
         sh=dc if sh is None else torch.cat([dc, _bands(header, sh, vertex.count)], 1),
     )
@@ -92,7 +92,7 @@ def write_compressed_ply(path: Path, gaussians: Gaussians, metadata: SceneMetada
     largest, three = smallest_three(g.quaternions)
     packed = [
         _packed(unit[:, :3], _POSITION_BITS),
-        largest << 30 | _packed(three * _HALF_SQRT2 + 0.5, (10, 10, 10)),
+        largest << 30 | _packed(three * HALF_SQRT2 + 0.5, (10, 10, 10)),
         _packed(unit[:, 3:6], _POSITION_BITS),
         _packed(torch.cat([unit[:, 6:], g.opacities[:, None]], 1), (8, 8, 8, 8)),
     ]

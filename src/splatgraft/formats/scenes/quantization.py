@@ -11,6 +11,8 @@ from splatgraft.core.gaussians import Gaussians
 
 SMALLEST_SCALE = 1e-30
 """Linear scale, world units, that replaces 0, because its logarithm is stored."""
+HALF_SQRT2 = 0.5**0.5
+"""Largest magnitude of a component besides the largest of a unit quaternion."""
 _MORTON_BITS = 10  # per axis
 
 

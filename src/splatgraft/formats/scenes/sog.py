@@ -47,12 +47,8 @@ _FREE_BYTES = 1 << 20  # files below this size may expand further
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others are unpacked whole, beyond the size that the zip states
 _MAX_LOG_POSITION = 60.0  # beyond, float32 overflows soon
 _CODES = 256
-_SCALAR_ROUNDS = 100  # iterations of k-means for a code book
 _COARSE_GROUPS = 256
-_COARSE_SAMPLE = 1 << 15  # rows from which the coarse groups are found
 _ROUNDS = 5  # iterations of k-means for groups and entries; more changed the demo's renders by less than 0.1 dB
-_ROWS_AT_ONCE = 1 << 14
-_DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def is_sog_folder(path: Path) -> bool:
@@ -214,7 +210,7 @@ def encode_sog(path: Path, gaussians: Gaussians, metadata: SceneMetadata = Scene
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name, data in {_META_FILE: json.dumps(meta, separators=(",", ":")).encode(), **pictures}.items():
-            archive.writestr(zipfile.ZipInfo(name, _DATE), data)
+            archive.writestr(zipfile.ZipInfo(name), data)
     return buffer.getvalue()
 
 
@@ -240,7 +236,7 @@ def scalar_codes(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "256"]:
     quantiles = np.quantile(ordered, (np.arange(_CODES // 2) + 0.5) / (_CODES // 2))
     codes = np.sort(np.concatenate([quantiles, np.linspace(ordered[0], ordered[-1], _CODES // 2)]))
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    for _ in range(_SCALAR_ROUNDS):
+    for _ in range(100):
         ends = np.concatenate([[0], np.searchsorted(ordered, (codes[1:] + codes[:-1]) / 2), [len(ordered)]])
         counts = np.diff(ends)
         codes = np.where(counts > 0, np.diff(sums[ends]) / np.maximum(counts, 1), codes)
@@ -257,7 +253,7 @@ def palette(rows: Float[Tensor, "n f"], size: int) -> tuple[Float[Tensor, "p f"]
     n = len(rows)
     if n <= size:
         return rows, torch.arange(n)
-    sample = rows[_spread(n, min(n, _COARSE_SAMPLE))]
+    sample = rows[_spread(n, min(n, 1 << 15))]
     coarse = k_means(sample, sample[_spread(len(sample), min(_COARSE_GROUPS, size))], rounds=_ROUNDS)
     group = _nearest(rows, coarse)
     members = [torch.nonzero(group == i)[:, 0] for i in range(int(group.max()) + 1)]
@@ -281,4 +277,4 @@ def _spread(n: int, count: int) -> Int64[Tensor, "count"]:
 
 
 def _nearest(rows: Float[Tensor, "n f"], means: Float[Tensor, "k f"]) -> Int64[Tensor, "n"]:
-    return torch.cat([torch.cdist(part, means).argmin(1) for part in rows.split(_ROWS_AT_ONCE)])
+    return torch.cat([torch.cdist(part, means).argmin(1) for part in rows.split(1 << 14)])

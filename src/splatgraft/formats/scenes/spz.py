@@ -17,6 +17,7 @@ from torch import Tensor
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
 from splatgraft.formats.scenes.quantization import (
+    HALF_SQRT2,
     bytes_from_unit,
     from_smallest_three,
     logits_from_bytes,
@@ -33,14 +34,11 @@ _HEADER = struct.Struct("<IIIBBBB")
 """Magic number, version, Gaussians, SH degree, fractional bits of positions, flags, streams (version 4)."""
 _TABLE_START = struct.Struct("<I12x")
 _TABLE_ENTRY = struct.Struct("<QQ")
-_ANTIALIASED = 1
 _GZIP = 31  # window bits of zlib for a gzip stream
-_ZSTD_LEVEL = 12  # the level of the format's own library
 _MAX_EXPANSION = 100
 """Largest ratio of the arrays' bytes to compressed ones: trained scenes have about 2, repeated Gaussians 50."""
 _FREE_BYTES = 1 << 20  # arrays below this size may expand further
 _COLOR_SCALE = 0.15
-_HALF_SQRT2 = 0.5**0.5
 
 
 def read_spz(path: Path) -> SceneFile:
@@ -77,7 +75,7 @@ def read_spz(path: Path) -> SceneFile:
         sh=torch.cat([((colors.float() / 255 - 0.5) / _COLOR_SCALE)[:, None], bands], 1),
     )
     filtered = 'trained with an anti-aliasing filter: set low_pass = "antialiased" in [render] and [consolidate]'
-    return SceneFile(change_axes(gaussians, rdf_from(AXES)), AXES, notes=(filtered,) if flags & _ANTIALIASED else ())
+    return SceneFile(change_axes(gaussians, rdf_from(AXES)), AXES, notes=(filtered,) if flags & 1 else ())
 
 
 def _zstd_arrays(path: Path, data: bytes, streams: int, sizes: list[int]) -> list[bytes]:
@@ -128,7 +126,7 @@ def _four_bytes_unpacked(rotations: UInt8[Tensor, "n 4"]) -> Float[Tensor, "n 4"
     """Decode the index of the largest of x, y, z, w in two bits, then the others in order: sign and 9 bits each."""
     packed = torch.from_numpy(rotations.numpy().view("<u4")[:, 0].astype(np.int64))
     three = packed[:, None] >> torch.tensor([20, 10, 0]) & 0x3FF
-    values = (three & 0x1FF).float() / 0x1FF * _HALF_SQRT2 * torch.where(three >> 9 == 1, -1.0, 1.0)
+    values = (three & 0x1FF).float() / 0x1FF * HALF_SQRT2 * torch.where(three >> 9 == 1, -1.0, 1.0)
     return from_smallest_three(packed >> 30, values)[:, [3, 0, 1, 2]]
 
 
@@ -155,7 +153,7 @@ def write_spz(path: Path, gaussians: Gaussians, _: SceneMetadata = SceneMetadata
     ]
     head = (_MAGIC, version, g.count, g.sh_degree, bits, 0)
     if version == 4:
-        compressor = _zstandard(path).ZstdCompressor(level=_ZSTD_LEVEL, write_content_size=True)
+        compressor = _zstandard(path).ZstdCompressor(level=12, write_content_size=True)  # as in load-spz.cc
         streams = [(compressor.compress(array), len(array)) for array in arrays if array]
         table_start = _HEADER.size + _TABLE_START.size
         table = b"".join(_TABLE_ENTRY.pack(len(stream), size) for stream, size in streams)
@@ -169,6 +167,6 @@ def write_spz(path: Path, gaussians: Gaussians, _: SceneMetadata = SceneMetadata
 
 def _four_bytes(quaternions: Float[Tensor, "n 4"]) -> np.ndarray:
     largest, three = smallest_three(quaternions[:, [1, 2, 3, 0]])
-    magnitude = (three.abs() / _HALF_SQRT2 * 0x1FF).round().clamp(0, 0x1FF).to(torch.int64)
+    magnitude = (three.abs() / HALF_SQRT2 * 0x1FF).round().clamp(0, 0x1FF).to(torch.int64)
     fields = magnitude | (three < 0).to(torch.int64) << 9
     return (largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]).numpy().astype("<u4")
