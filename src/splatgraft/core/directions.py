@@ -1,4 +1,4 @@
-"""Unit vectors: even sets over the sphere, spirals over a cone, perpendicular axes, light frames; harmonic fits."""
+"""Unit vectors (even sets over the sphere, spirals over a cone, perpendicular axes, light frames) and harmonic fits."""
 
 import math
 

@@ -1,8 +1,8 @@
 """LDR-FLIP (Andersson et al. 2020): the visible difference of two images that alternate on a screen.
 
 Colours are compared after the blur of the eye's contrast sensitivity, edges and points before it. Equation and section
-numbers are those of the paper. The authors' package flip-evaluator gives the same values (a test compares them) but has
-no wheels for Linux on ARM nor for Python 3.14, and every report of `evaluate` with a ground truth has FLIP.
+numbers are those of the paper. Every report of `evaluate` with a ground truth has FLIP. The authors' package
+flip-evaluator gives the same values (a test compares them), but has no wheels for Linux on ARM and Python 3.14.
 """
 
 import math
