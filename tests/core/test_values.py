@@ -136,6 +136,19 @@ def test_look_at_stays_on_the_device_of_its_points():
     assert (poses.device.type, poses.shape) == ("meta", (2, 4, 4))
 
 
+def test_projection_inverts_unprojection_and_follows_the_world_rays():
+    poses = look_at(torch.tensor([[2.0, 1, 1], [0, 3, 1]]), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
+    camera = pinhole(poses, 30.0, width=24, height=16)[1]
+    depth = torch.rand(16, 24) + 0.5
+    points = camera.unproject(depth)
+    pixels, found = camera.project(points)
+    rows, columns = torch.meshgrid(torch.arange(16) + 0.5, torch.arange(24) + 0.5, indexing="ij")
+    torch.testing.assert_close(found, depth)
+    torch.testing.assert_close(pixels, torch.stack([columns, rows], -1), atol=2e-5, rtol=0)  # float32 of up to 24
+    torch.testing.assert_close(camera.centers[0] + depth[..., None] * camera.world_rays(), points)
+    assert camera.project(2 * camera.centers[0] - points)[1].max() < 0  # behind the camera
+
+
 def shell(center, radius, *, count=1000, scale=0.01, opacity=0.9):
     """Small opaque Gaussians spread evenly over a sphere."""
     return Gaussians(

@@ -49,9 +49,8 @@ def triangulate(cameras: Cameras, pixels: Float[Tensor, "v 2"]) -> tuple[Float[T
         names = ", ".join(cameras.names)
         raise ValueError(f"point: expected images from different directions, found almost the same in {names}")
     point = torch.linalg.solve(across.sum(0), (across @ cameras.centers.double()[..., None])[..., 0].sum(0))
-    pose = cameras.camera_from_world.double()
-    seen = (cameras.intrinsics.double() @ (pose[:, :3, :3] @ point + pose[:, :3, 3])[..., None])[..., 0]
-    return point.float(), float((seen[:, :2] / seen[:, 2:] - pixels).norm(dim=1).mean())
+    seen = torch.stack([camera.project(point)[0] for camera in cameras])
+    return point.float(), float((seen - pixels).norm(dim=1).mean())
 
 
 def scale_from_length(ends: tuple[Float[Tensor, "3"], Float[Tensor, "3"]], metres: float) -> MetricScale:

@@ -283,12 +283,11 @@ def median_parallax_deg(cameras: Cameras, points: Float[Tensor, "m 3"]) -> float
 
 def _seen(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Tensor:
     """Which camera has which point in its image, (v, m)."""
-    poses = cameras.camera_from_world.double()
-    x = torch.einsum("vij,mj->vmi", poses[:, :3, :3], points) + poses[:, None, :3, 3]
-    pixels = torch.einsum("vij,vmj->vmi", cameras.intrinsics.double(), x)
-    pixels = pixels[..., :2] / pixels[..., 2:].clamp_min(1e-9)
-    inside = (pixels >= 0).all(-1) & (pixels < cameras.sizes[:, None].double()).all(-1)
-    return inside & (x[..., 2] > 0)
+    seen = []
+    for camera in cameras:
+        pixels, depth = camera.project(points)
+        seen.append((depth > 0) & (pixels >= 0).all(-1) & (pixels < camera.sizes[0].double()).all(-1))
+    return torch.stack(seen)
 
 
 def _widest_deg(centers: Float[Tensor, "v 3"], points: Float[Tensor, "m 3"], seen: Tensor) -> Float[Tensor, "m"]:

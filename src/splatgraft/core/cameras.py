@@ -122,6 +122,27 @@ class Cameras:
         v, u = torch.meshgrid(torch.arange(self.height) + 0.5, torch.arange(self.width) + 0.5, indexing="ij")
         return torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(self.intrinsics[0]).T
 
+    def world_rays(self) -> Float[Tensor, "h w 3"]:
+        """Compute directions to the pixel centres of the first camera, in the world, scaled to depth 1."""
+        return self.rays() @ self.world_from_camera[0, :3, :3].T
+
+    def unproject(self, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
+        """Compute the world points of the first camera's pixels from their depths along its optical axis."""
+        pose = self.world_from_camera[0].to(depth)
+        # in the camera first: rays in the world times depth round differently
+        return (self.rays().to(depth) * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+
+    def project(self, points: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Float[Tensor, "*n"]]:
+        """Project world points into the first camera.
+
+        Returns:
+            Pixels x and y, which have no meaning unless the depth is above 0, and depths along the optical axis.
+        """
+        pose, intrinsics = self.camera_from_world[0].to(points), self.intrinsics[0].to(points)
+        in_camera = points @ pose[:3, :3].T + pose[:3, 3]
+        depth = in_camera[..., 2]
+        return (in_camera @ intrinsics.T)[..., :2] / depth[..., None].clamp_min(1e-9), depth
+
     def spread(self, count: int) -> "Cameras":
         """Select at most `count` cameras, evenly spaced in their order, with the first and the last."""
         return self[torch.linspace(0, len(self) - 1, min(count, len(self))).round().long()]

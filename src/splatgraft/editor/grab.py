@@ -126,11 +126,9 @@ class Grab:
 
 def outline(points: Float[Tensor, "n 3"], camera: Cameras) -> list[Point2]:
     """The convex outline of points in a view, on its canvas; empty where they are behind the camera."""
-    pose, chosen = camera.camera_from_world[0], points[:: max(1, len(points) // _HULL_POINTS)]
-    local = (chosen @ pose[:3, :3].T + pose[:3, 3]) @ camera.intrinsics[0].T
-    local = local[local[:, 2] > 0]
-    if len(local) < 3:
+    pixels, depth = camera.project(points[:: max(1, len(points) // _HULL_POINTS)])
+    pixels = pixels[depth > 0]
+    if len(pixels) < 3:
         return []
-    pixels = local[:, :2] / local[:, 2:]
     hull = cv2.convexHull(pixels.numpy().astype(np.float32))[:, 0]
     return [(round(float(x) / camera.width, 4), round(float(y) / camera.height, 4)) for x, y in hull]

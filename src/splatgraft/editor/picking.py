@@ -27,12 +27,10 @@ class Rectangle:
 
 def in_rectangle(means: Float[Tensor, "n 3"], camera: Cameras, rectangle: Rectangle) -> Bool[Tensor, "n"]:
     """Which centres project into the rectangle in one camera, occluded ones included."""
-    pose = camera.camera_from_world[0].to(means)
-    local = means @ pose[:3, :3].T + pose[:3, 3]
-    pixels = (local @ camera.intrinsics[0].to(means).T)[:, :2] / local[:, 2:].clamp_min(1e-9)
+    pixels, depth = camera.project(means)
     share = pixels / camera.sizes[0].to(means)
     inside = (share >= torch.tensor(rectangle.lower)) & (share <= torch.tensor(rectangle.upper))
-    return inside.all(1) & (local[:, 2] > 0)
+    return inside.all(1) & (depth > 0)
 
 
 def first_surface_hit(

@@ -129,12 +129,9 @@ def _nearest_to_axes(centers: Float[Tensor, "v 3"], forward: Float[Tensor, "v 3"
 
 def _views_that_see(points: Float[Tensor, "m 3"], cameras: Cameras) -> Float[Tensor, "m"]:
     count = torch.zeros(len(points), dtype=torch.float64)
-    for pose, intrinsics, size in zip(
-        cameras.camera_from_world.double().cpu(), cameras.intrinsics.double().cpu(), cameras.sizes, strict=True
-    ):
-        x = (points @ pose[:3, :3].T + pose[:3, 3]) @ intrinsics.T
-        pixel = x[:, :2] / x[:, 2:].clamp_min(1e-9)
-        count += (x[:, 2] > 0) & (pixel >= 0).all(1) & (pixel < size).all(1)
+    for camera in cameras:
+        pixel, depth = camera.project(points)
+        count += (depth > 0) & (pixel >= 0).all(1) & (pixel < camera.sizes[0]).all(1)
     return count
 
 
@@ -203,11 +200,9 @@ def _colors(
     """Mean colour of the points in all images, and which any camera sees."""
     total, count = torch.zeros(len(points), 3), torch.zeros(len(points))
     for camera, image in zip(cameras, images, strict=True):
-        pose, k = camera.camera_from_world[0].float(), camera.intrinsics[0].float()
-        x = points @ pose[:3, :3].T + pose[:3, 3]
-        pixels = (x @ k.T)[:, :2] / x[:, 2:].clamp_min(1e-6)
+        pixels, depth = camera.project(points)
         size = torch.tensor([camera.width, camera.height])
-        inside = (x[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+        inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
         column, row = pixels[inside].long().T
         total[inside] += image[row, column]
         count[inside] += 1

@@ -285,12 +285,9 @@ def _framed(points: Float[Tensor, "n 3"], cameras: Cameras, prompts: Mapping[int
     inside = torch.ones(len(points), dtype=torch.bool, device=points.device)
     for index, prompt in prompts.items():
         if prompt.box is not None:
-            camera = cameras[index]
-            pose = camera.camera_from_world[0].to(points)
-            local = points @ pose[:3, :3].T + pose[:3, 3]
-            pixels = (local @ camera.intrinsics[0].to(points).T)[:, :2] / local[:, 2:].clamp_min(1e-9)
+            pixels, depth = cameras[index].project(points)
             corners = torch.tensor(prompt.box).to(points)
-            inside &= ((pixels >= corners[:2]) & (pixels <= corners[2:])).all(1) & (local[:, 2] > 0)
+            inside &= ((pixels >= corners[:2]) & (pixels <= corners[2:])).all(1) & (depth > 0)
     return inside
 
 

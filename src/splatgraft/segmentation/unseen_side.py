@@ -194,11 +194,9 @@ def _inside_masks(
     """Which points lie inside nearly all masks that could show them."""
     inside, shown, left = torch.zeros(len(points)), torch.zeros(len(points)), torch.arange(len(points))
     for camera, mask in zip(cameras, masks, strict=True):
-        pose, k = camera.camera_from_world[0].to(points), camera.intrinsics[0].to(points)
-        local = points[left] @ pose[:3, :3].T + pose[:3, 3]
-        pixels = (local @ k.T)[:, :2] / local[:, 2:].clamp_min(1e-6)
+        pixels, depth = camera.project(points[left])
         height, width = mask.shape
-        framed = (local[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([width, height])).all(1)
+        framed = (depth > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([width, height])).all(1)
         column, row = pixels.nan_to_num(0).clamp(-1, 1e6).long().unbind(1)
         inside[left] += framed & (mask[row.clamp(0, height - 1), column.clamp(0, width - 1)] > 0.5)
         shown[left] += framed

@@ -80,7 +80,7 @@ def insert(target: ReflectiveScene, objects: Sequence[ReflectiveScene]) -> Refle
 
 def pixel_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
     """Unit directions in the world from one camera through the centres of its pixels."""
-    return F.normalize(camera.rays() @ camera.world_from_camera[0, :3, :3].T, dim=-1)
+    return F.normalize(camera.world_rays(), dim=-1)
 
 
 @dataclass(frozen=True)

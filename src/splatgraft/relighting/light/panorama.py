@@ -249,10 +249,7 @@ def _sum(values: Float[Tensor, "p ..."], index: Int[Tensor, "p"]) -> Float[Tenso
 def _photographed(points: Float[Tensor, "p 3"], cameras: Cameras) -> Bool[Tensor, "p"]:
     """Whether a point is within some camera's picture; what is in front of it is not tested."""
     found = torch.zeros(len(points), dtype=torch.bool)
-    whole = torch.cat([points, torch.ones(len(points), 1)], 1)
-    for i in range(len(cameras)):
-        in_camera = whole @ cameras.camera_from_world[i, :3].T
-        pixels = in_camera @ cameras.intrinsics[i].T
-        pixels = pixels[:, :2] / pixels[:, 2:].clamp_min(1e-6)
-        found |= (in_camera[:, 2] > 0) & (pixels > 0).all(1) & (pixels < cameras.sizes[i].float()).all(1)
+    for camera in cameras:
+        pixels, depth = camera.project(points)
+        found |= (depth > 0) & (pixels > 0).all(1) & (pixels < camera.sizes[0].float()).all(1)
     return found

@@ -157,7 +157,7 @@ def find_surface(captured: CapturedScene, region: BoundingSphere) -> Surface | N
     """The level surface that most of a region shows to the cameras; None where there is none."""
     seen = []
     for camera, drawn in captured.views:
-        points = _unprojected(camera, drawn.depth[0])
+        points = camera.unproject(drawn.depth[0])
         seen.append(points[(drawn.alpha[0] > _SOLID) & ((points - region.center).norm(dim=-1) < region.radius)])
     points = torch.cat(seen)
     points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:_MAX_POINTS]]
@@ -186,17 +186,11 @@ def standing_on(surface: Surface, scene: Gaussians, region: BoundingSphere) -> O
     return occluders_of(thinned(above, width=2 * surface.half / _SIZE))
 
 
-def _unprojected(camera: Cameras, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
-    """The points that the pixels of one camera show, world units."""
-    return (camera.rays() * depth[..., None]) @ camera.world_from_camera[0, :3, :3].T + camera.centers[0]
-
-
 def _seen_texels(surface: Surface, camera: Cameras, drawn: Render) -> Float[Tensor, "s s 3"]:
     """Logarithm of the linear rgb that one view shows of the texels; nan where it does not show the surface there."""
-    texels, pose = surface.texels(), camera.camera_from_world[0]
-    local = texels @ pose[:3, :3].T + pose[:3, 3]
-    away = local[..., 2].clamp_min(1e-6)
-    at = (local @ camera.intrinsics[0].T)[..., :2] / away[..., None] / camera.sizes[0].to(texels) * 2 - 1
+    texels = surface.texels()
+    pixels, depth = camera.project(texels)
+    away, at = depth.clamp_min(1e-6), pixels / camera.sizes[0].to(texels) * 2 - 1
     color = linear_from_srgb(drawn.color[0].clamp(0, 1))
     picture = torch.cat([color, drawn.depth[0][..., None]], -1).permute(2, 0, 1)
     sampled = F.grid_sample(picture[None], at[None], align_corners=False)[0]
@@ -205,7 +199,7 @@ def _seen_texels(surface: Surface, camera: Cameras, drawn: Render) -> Float[Tens
     steepness = -(rays @ surface.plane.normal) / distance
     # height over the plane of what the view shows along the ray to a texel
     height = (1 - sampled[3] / away) * distance * steepness
-    shown = (local[..., 2] > 0) & (at.abs().amax(-1) < 1) & (height.abs() < surface.plane.thickness)
+    shown = (depth > 0) & (at.abs().amax(-1) < 1) & (height.abs() < surface.plane.thickness)
     shown &= steepness > _FLATTEST
     return torch.where(shown[..., None], sampled[:3].permute(1, 2, 0).clamp_min(1e-3).log(), math.nan)
 

@@ -158,7 +158,7 @@ def views_of_surface(
 
 def _cut_to(camera: Cameras, points: Float[Tensor, "s 3"]) -> Cameras | None:
     """The camera cut to what it shows of `points`, and reduced; None where it shows nothing of them."""
-    pixels, depth = _projected(camera, points)
+    pixels, depth = camera.project(points)
     size = camera.sizes[0].float()
     seen = (depth > 0) & (pixels > 0).all(1) & (pixels < size).all(1)
     if not bool(seen.any()):
@@ -168,14 +168,6 @@ def _cut_to(camera: Cameras, points: Float[Tensor, "s 3"]) -> Cameras | None:
     low, high = (low - margin).clamp_min(0).floor(), torch.minimum(high + margin, size).ceil()
     window = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
     return camera.cropped([window]).resized(min(1.0, _LONGEST_PX / float((high - low).max())))
-
-
-def _projected(camera: Cameras, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Pixels and depths of points."""
-    pose = camera.camera_from_world[0]
-    local = points @ pose[:3, :3].T + pose[:3, 3]
-    seen = local @ camera.intrinsics[0].T
-    return seen[:, :2] / seen[:, 2:].clamp_min(1e-6), local[:, 2]
 
 
 def _view(
@@ -215,7 +207,7 @@ def _widened(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 
 def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
     """Unit directions of the pixels' rays, in the world."""
-    return F.normalize(camera.rays() @ camera.world_from_camera[0, :3, :3].T, dim=-1)
+    return F.normalize(camera.world_rays(), dim=-1)
 
 
 _REACH = np.float32(3)  # standard deviations by which a Gaussian's centre may lie outside the picture
