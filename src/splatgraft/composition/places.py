@@ -305,8 +305,7 @@ def _picture(target: Gaussians, ground: _Ground, *, cameras: Cameras) -> Float[T
     camera = views[shown.index(max(shown))].limited(_PICTURE_PX)
     drawn = render(target, camera, outputs=frozenset({"color", "depth"}))
     color, depth = drawn.color[0].detach(), drawn.depth[0].detach()
-    pose = camera.world_from_camera[0].to(depth)
-    points = (camera.rays().to(depth) * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
+    points = camera.unproject(depth)
     below_map, pixels, inside = _project(points.reshape(-1, 3), surface.camera)
     at = (pixels[:, 1].long().clamp(0, _MAP_SIZE_PX - 1), pixels[:, 0].long().clamp(0, _MAP_SIZE_PX - 1))
     plane_below_map = _project(surface.points.reshape(-1, 3), surface.camera)[0].view_as(ground.rise) + ground.rise
@@ -421,11 +420,7 @@ def _visible_points(scene: Gaussians, points: Float[Tensor, "m 3"], *, camera: C
 
 def _project(points: Float[Tensor, "m 3"], camera: Cameras) -> tuple[Tensor, Tensor, Tensor]:
     """Depth Float[m], pixel Float[m 2], and Bool[m] whether the point lies inside the camera's image."""
-    pose = camera.camera_from_world[0].to(points)
-    in_camera = points @ pose[:3, :3].T + pose[:3, 3]
-    depth = in_camera[:, 2]
-    intrinsics = camera.intrinsics[0].to(points)
-    pixels = (in_camera @ intrinsics.T)[:, :2] / depth.clamp_min(1e-9)[:, None]
+    pixels, depth = camera.project(points)
     size = camera.sizes[0].to(points)
     inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
     return depth, pixels.nan_to_num(0).clamp(-1e6, 1e6), inside
