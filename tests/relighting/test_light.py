@@ -21,9 +21,10 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.relighting.captured_scene import CapturedScene
+from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
-from splatgraft.relighting.light.light import Light, fit_ambient
+from splatgraft.relighting.light.light import Light, LightSource, fit_ambient, light_confidence
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
     Surroundings,
@@ -415,7 +416,18 @@ def test_what_shadows_alone_show_is_named_by_where_it_may_be(height, name):
     sun = torch.nn.functional.normalize(torch.tensor([0.3, 0.3, height]), dim=0)
     light = estimated(sunlit_scene(sun, strength=3.0), views((0.0, 1.5)))
     assert light.sources[0].name == name
-    assert f"{name} " in light.describe(UP)
+    assert f"{name} " in describe_light(light, UP)
+
+
+@pytest.mark.parametrize(("uncertainty_deg", "is_doubted"), [(14.0, False), (17.0, True)])
+def test_a_direction_is_called_uncertain_from_15_degrees_on(uncertainty_deg, is_doubted):
+    source = LightSource((0.0, 0.0, 1.0), (1.0, 1.0, 1.0), uncertainty_deg=uncertainty_deg)
+    light = Light((source,), fit_ambient(torch.tensor([0.2, 0.2, 0.2])))
+    assert ("its direction is uncertain" in describe_light(light, UP)) == is_doubted
+    # the confidence has a scale of its own, 20 degrees
+    sun, rest = source.luminance, math.pi * 0.2
+    expected = (rest + sun * math.exp(-((uncertainty_deg / 20) ** 2))) / (rest + sun)
+    assert light_confidence(light) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("strength", [0.0, 1.0])
