@@ -224,7 +224,7 @@ def _smooth_lobe(normals: Float[Tensor, "p 3"], towards: Float[Tensor, "p v 3"])
 
 
 def _rough_lobe(normals: Float[Tensor, "p 3"], towards: Float[Tensor, "p v 3"]) -> Float[Tensor, "p v k"]:
-    """Compute the lobe of a rough dielectric (GGX, Walter et al. 2007); it peaks flatter than the mirrored direction."""
+    """Compute the lobe of a rough dielectric (GGX, Walter et al. 2007); its peak is flatter than the mirror's."""
     a2 = _ROUGHNESS**4
     light = (normals @ DIRECTIONS.T).clamp_min(0)[:, None]
     view = (towards * normals[:, None]).sum(-1, keepdim=True).clamp_min(1e-3)
