@@ -4,7 +4,7 @@
 2. Find the radiance of 320 directions that explains it (`radiance_search.py`).
 3. Turn peaks of that radiance into sources, and the rest into ambient light of degree 2.
 4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it.
-5. Set the distance up to which occluders block each source, so that a window's pane does not block the window's light.
+5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
 
 The ambient light is also available as an environment map for programs that light meshes. Photographed directions have
 the scene's own radiance in full resolution, all others the radiance of the estimate. Sources are left out: their

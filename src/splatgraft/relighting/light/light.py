@@ -46,7 +46,7 @@ class LightSource:
     name: str = "light"
     """Name in reports, such as "sun", "window" or, if either is possible, "sun or window"."""
     blockers_within: float = math.inf
-    """Distance up to which occluders block the light, world units; ends before a window's pane."""
+    """Maximum distance of occluders that block the light, world units; a window's pane lies beyond it."""
     distance: float = math.inf
     """Distance from the middle of the lit object, world units, above 0; infinite for the sun. A near light's shadows
     diverge and its irradiance falls off."""
