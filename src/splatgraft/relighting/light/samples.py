@@ -1,6 +1,7 @@
-"""Samples of a `Light`: sources and ambient light as sets of directional lights, each of which has a shadow map.
+"""Samples of a `Light`: directional lights with one shadow map each.
 
-A wide source becomes several samples over its cone, the ambient light 32 samples spread evenly over the sphere.
+A source becomes one sample, or several over its cone if it is wide. The ambient light becomes 32 samples spread evenly
+over the sphere.
 """
 
 import math
