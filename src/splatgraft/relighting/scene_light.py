@@ -2,9 +2,9 @@
 
 Shadow maps and sources are valid while the objects move by less than half of the maps' radius (`SceneLight.moved`).
 
-Uncaptured things may block the scene's main light: sunlight through a window lights a patch of a table, but the frame of
-the window is missing from the shadow maps. The table's colours show the patch. So the visibility of the main light is
-also measured from brightness, which is compared within groups of one material and smoothed over neighbours.
+Uncaptured things may block the scene's main light: sunlight through a window lights a patch of a table, but the
+window's frame is missing from the shadow maps. The table's colours show the patch. So the visibility of the main light
+is also measured from brightness, which is compared within groups of one material and smoothed over neighbours.
 """
 
 from collections.abc import Sequence
