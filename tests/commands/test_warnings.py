@@ -68,6 +68,7 @@ def test_the_report_begins_with_all_warnings_of_the_run(
 ) -> None:
     # the object stands where nothing was captured, so that there is no light to be found
     warned = copy_project() / "project.toml"
+    warned.write_text(warned.read_text().replace('light = "off"', 'light = "transfer"'))
     far = Similarity(1.0, torch.eye(3), torch.tensor([500.0, 0.0, 0.0]))
     write_placement(warned.parent / "placement.json", Placement(objects=(ObjectPlacement(target_from_object=far),)))
     assert main(["run", str(warned)]) == 0
