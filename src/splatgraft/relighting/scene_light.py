@@ -19,7 +19,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.relighting.captured_scene import CapturedScene
-from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light, with_source_distances
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light, with_blocker_distances
 from splatgraft.relighting.light.evidence import group_materials
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama import NoLight
@@ -40,7 +40,7 @@ _KEPT_SHIFT = 0.5  # maximum distance of the objects' place from the centre of a
 _SMOOTHED = 64  # gaussians in the median
 _CONTRAST = 0.5  # minimum irradiance of the main light over that of the rest; with less, brightness does not show it
 _MIN_GAUSSIANS = 500  # with fewer the visibility is not measured
-_LIT_QUANTILE = 0.75  # quantile of apparent albedo in a group whose Gaussians count as fully lit
+_LIT_QUANTILE = 0.75  # quantile of apparent albedo in a group that counts as the albedo of fully lit Gaussians
 _RAMP_START, _RAMP_WIDTH = 0.2, 0.4  # ramp from 0 to 1 over the measured visibility: faint light counts as none
 
 
@@ -63,7 +63,7 @@ class SceneLight:
     receivers_of: tuple[BoundingSphere, ...]
     """Bounding spheres of the objects for which the receivers were chosen."""
     reach: float
-    """Length of shadows, object radii."""
+    """Maximum length of shadows, object radii."""
 
     def moved(self, spheres: Sequence[BoundingSphere]) -> "SceneLight | NoLight | None":
         """Move the objects: keep sources and shadow maps, and compute the ambient light at the new place.
@@ -109,7 +109,7 @@ def find_scene_light(
         captured: The scene without erased Gaussians.
         spheres: Bounding spheres of the objects, at least one.
         light: A given light, with sources as seen from the objects' place; None to estimate it.
-        reach: Length of shadows, object radii.
+        reach: Maximum length of shadows, object radii.
         sun_through: Points and their shadows, as for `light.sun.set_sun`, from which an estimate takes its sun.
 
     Returns:
@@ -123,7 +123,7 @@ def find_scene_light(
             return found
         estimate, light = found, found.light
     else:
-        light = with_source_distances(light, scene, place)
+        light = with_blocker_distances(light, scene, place)
     samples = sample_light(light)
     maps = scene_shadow_maps(scene, BoundingSphere(place.center, _MARGIN * (place.radius * reach)), samples)
     receivers = _receivers(captured, spheres, light, maps)

@@ -85,7 +85,7 @@ def _describe(found: LocalGain) -> str:
 
 
 def _gain_of(placed: PlacedObject, source: SourceScene | None, scene: Gaussians, cameras: Cameras) -> LocalGain | str:
-    """Compute the gain from the object's old place to its new one, or the reason why there is none, a sentence."""
+    """Compute the gain from the object's old place to its new one, or say why it is unknown."""
     if not placed.gaussians.count:
         return "It is empty."
     if source is None:

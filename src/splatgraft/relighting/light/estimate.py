@@ -100,7 +100,7 @@ class EstimatedLight:
         The surface of `scene` at which the view towards the sun ends, such as a window's pane, does not block it.
         """
         named = replace(sun, name=sun.name or self._name_at(sun.direction))
-        placed = with_source_distances(with_sun(self.mean, named), scene, self.place)
+        placed = with_blocker_distances(with_sun(self.mean, named), scene, self.place)
         return replace(self, sun=replace(named, blockers_within=placed.sources[0].blockers_within))
 
     def _name_at(self, direction: Float[Tensor, "3"]) -> str:
@@ -158,7 +158,7 @@ def estimate_light(
     )
     hidden = search_radiance(radiance_problem(evidence))
     sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
-    mean = with_source_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
+    mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, place)
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
     return found if sun is None else found.with_sun(sun, scene)
@@ -237,7 +237,7 @@ def _mean_distance(distances: Float[Tensor, "p"], weight: Float[Tensor, "p"]) ->
     return 1 / nearness if nearness > 0 else math.inf
 
 
-def with_source_distances(light: Light, scene: Gaussians, place: BoundingSphere) -> Light:
+def with_blocker_distances(light: Light, scene: Gaussians, place: BoundingSphere) -> Light:
     """Set every infinite `blockers_within` of a light's sources from the depth of the scene towards the source.
 
     Args:

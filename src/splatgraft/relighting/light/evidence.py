@@ -70,7 +70,7 @@ _HIGHLIGHT_CHUNK = 250  # gaussians at a time; bounds memory
 def group_materials(brightness: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]) -> Int[Tensor, "m"]:
     """Group Gaussians that likely share one material and one side of it, by k-means, and return their group indices.
 
-    Features are chromaticity and normal. Brightness is none of them because it would separate lit from shaded parts.
+    Features are chromaticity and normal, but not brightness, which would separate lit from shaded parts.
 
     Args:
         brightness: Linear rgb of the m Gaussians.
