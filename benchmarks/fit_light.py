@@ -1,12 +1,14 @@
-"""Fits the numbers of the light estimate over rendered scenes with known light, and checks them across scenes.
+"""Fit the parameters of the light estimate over rendered scenes with known light, and cross-validate them.
 
     python benchmarks/fit_light.py SCENES [SCENES ...] --work FOLDER [FOLDER ...] --evidence FOLDER
 
-SCENES are folders of scenes as `splatgraft paper exam` renders them. The objective, in stops: the mean over places of
-the RMS over 200 normals of log2(estimated / true irradiance), plus half of the same RMS of the ratio of both places.
-Numbers are changed a few at a time by random factors, and a change is kept where the objective falls. With `--folds`,
-the numbers are fitted as often without one part of the scenes, and the objective of the part left out is printed. What
-the fit needs of the scenes is kept in files (`--evidence`), and read from there by later runs.
+SCENES are folders of scenes as `splatgraft paper exam` renders them. The objective, in stops, has two terms. The first
+is the RMS over 200 normals of log2(estimated / true irradiance), averaged over the places. The second is half of the
+same RMS for the ratio of both places.
+
+1. Estimate the evidence at both places of each scene, and keep it in files (`--evidence`) for later runs.
+2. Change one to three parameters by random factors; keep the change if the objective falls.
+3. With `--folds N`, repeat this N times without one part of the scenes, and print the objective of that part.
 """
 
 import json
@@ -53,15 +55,14 @@ FACTORS = {
     "within_patch_sd": 1.6,
     "temperature": 1.6,
 }
-"""Standard deviation of each number's random factor."""
+"""Standard deviation of each parameter's random factor."""
 SHIFTS = {"sky_bias": 0.3}
-"""The same of a number that may be negative, added."""
-_WORSE = 0.01  # stops by which a change may be worse on half of the scenes before it is dropped
+"""Standard deviation of the random shift of a parameter that may be negative."""
 
 
 @dataclass(frozen=True)
 class TrainingPlace:
-    """One of a scene's two places: its evidence and its true irradiance."""
+    """Evidence and true irradiance at one of a scene's two places."""
 
     evidence: LightEvidence
     truth: Float[Tensor, "200"]
@@ -73,7 +74,7 @@ Pair: TypeAlias = tuple[TrainingPlace, TrainingPlace]
 
 
 def places_of(scene: ExamScene) -> Pair:
-    """The new and the old place, estimated by nothing but the reconstructions."""
+    """Collect the evidence at the new and the old place from the reconstructions alone."""
     placed, source = scene.composite.objects[0], scene.source
     there, thing = bounding_sphere(placed.gaussians), placed.gaussians
     new = estimate_light(CapturedScene(scene.composite.target, scene.cameras), bounding_sphere(placed.in_target()))
@@ -88,20 +89,20 @@ def _place(found: EstimatedLight | NoLight, truth: Light) -> TrainingPlace:
 
 
 def log_irradiance(place: TrainingPlace, numbers: dict[str, float]) -> Float[Tensor, "200"]:
-    """Estimated, base 2, gray."""
+    """Estimate the binary logarithm of gray irradiance on `NORMALS`."""
     problem = radiance_problem(place.evidence, settings=RadianceSettings(**numbers))
     radiance = search_radiance(problem).radiance(place.evidence)
     return irradiance_of(radiance.mean(1), NORMALS).clamp_min(1e-6).log2()
 
 
 def scene_errors(pair: Pair, numbers: dict[str, float]) -> list[float]:
-    """The RMS in stops at the new place, at the old one, and of the ratio."""
+    """Compute the RMS errors, stops, at the new place, at the old one, and of their ratio."""
     away = [log_irradiance(place, numbers) - place.truth.log2() for place in pair]
     return [float(e.pow(2).mean().sqrt()) for e in (*away, away[0] - away[1])]
 
 
 class Scenes:
-    """Scenes whose errors are computed by several processes, which inherit the evidence."""
+    """Scenes whose errors several processes compute; these inherit the evidence."""
 
     def __init__(self, pairs: dict[str, Pair], jobs: int) -> None:
         """Start `jobs` processes."""
@@ -110,7 +111,7 @@ class Scenes:
         self._pool = multiprocessing.get_context("fork").Pool(jobs, _start, (self._pairs,))
 
     def errors(self, numbers: dict[str, float], which: Sequence[int] | None = None) -> Float[Tensor, "s 3"]:
-        """Of some scenes, or of all."""
+        """Compute `scene_errors` of some scenes, or of all."""
         which = range(len(self.names)) if which is None else which
         return torch.tensor(self._pool.starmap(_errors_of, [(i, numbers) for i in which], chunksize=1))
 
@@ -128,16 +129,16 @@ def _errors_of(index: int, numbers: dict[str, float]) -> list[float]:
 
 
 def objective(found: Float[Tensor, "s 3"]) -> float:
-    """Of some scenes, in stops."""
+    """Compute the objective over some scenes' errors, stops."""
     return float(0.5 * found[:, :2].sum(1).mean() + 0.5 * found[:, 2].mean())
 
 
 def fit(
     scenes: Scenes, which: Sequence[int], numbers: dict[str, float], *, minutes: float, seed: int
 ) -> dict[str, float]:
-    """The best numbers for some scenes that a random search finds in the time.
+    """Search the best parameters for some scenes at random, for `minutes`.
 
-    A change that is worse on every second scene is not tried on the others.
+    A change that is worse on half of the scenes is not tried on the others.
     """
     rng, end = random.Random(seed), time.monotonic() + 60 * minutes
     first, rest = list(which[::2]), list(which[1::2])
@@ -152,7 +153,7 @@ def fit(
             else:
                 changed[name] = float(f"{numbers[name] * math.exp(rng.gauss(0, math.log(FACTORS[name]))):.3g}")
         found = [scenes.errors(changed, first)]
-        if objective(found[0]) > objective(known[0]) + _WORSE:
+        if objective(found[0]) > objective(known[0]) + 0.01:  # stops
             continue
         found.append(scenes.errors(changed, rest))
         value = objective(torch.cat(found))
@@ -166,13 +167,13 @@ def fit(
 def main() -> None:
     """Fit and print."""
     parser = scene_arguments(__doc__)
-    parser.add_argument("--evidence", type=Path, required=True, help="folder of what the fit needs of each scene")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--minutes", type=float, default=10.0, help="of every fit; 0 measures today's numbers")
-    parser.add_argument("--folds", type=int, default=0, help="parts of the cross-validation; 0: none")
-    parser.add_argument("--out", type=Path, help="receives the numbers as JSON")
+    parser.add_argument("--evidence", type=Path, required=True, help="folder for the evidence of each scene")
+    parser.add_argument("--jobs", type=int, default=2, help="number of processes")
+    parser.add_argument("--minutes", type=float, default=10.0, help="time of each fit; 0 measures today's parameters")
+    parser.add_argument("--folds", type=int, default=0, help="number of parts of the cross-validation; 0: none")
+    parser.add_argument("--out", type=Path, help="file that receives the parameters as JSON")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--start", type=Path, help="numbers to start from, as --out writes them")
+    parser.add_argument("--start", type=Path, help="parameters to start from, a file of --out")
     options = parser.parse_args()
     pairs = {}
     for name, read in scenes_in(options):

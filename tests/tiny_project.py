@@ -32,7 +32,7 @@ point = [0.0, 0.0, 0.5]
 scale = 0.8
 
 [relight]
-light = "gain"
+light = "off"
 
 [consolidate]
 passes = 1

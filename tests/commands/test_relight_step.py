@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -60,15 +59,20 @@ def at(x: float, y: float, scale: float = 0.5) -> Similarity:
 
 
 def test_copies_lose_the_same_old_light_and_a_strange_object_keeps_its_own(tmp_path: Path):
-    # the source's floor is dark, the target's bright
-    target = concatenate([plane((0.8, 0.8, 0.8)), replace(ball(), means=ball().means + torch.tensor([0.0, 0.0, 2.0]))])
     # the copies stand where as much of the target is around them
     objects = {"strange.ply": (ball(), [at(0, 0.5)]), "own.ply": (ball(), [at(-0.2, 0), at(0.2, 0)])}
-    found = relit(tmp_path, (target, plane((0.25, 0.25, 0.25))), objects, "--light", "gain")
-    strange, one, other = read_gaussians(found / "scene.ply").sh[-3 * ball().count :].chunk(3)
-    assert torch.equal(strange[:, 0], ball().sh[:, 0])
-    assert float((one - other).abs().max()) < 0.15 * float((one - ball().sh).abs().mean())
-    assert float((one - ball().sh).mean()) > 0.05
+    found = relit(tmp_path, (room(0.8), room(0.25)), objects)
+    notes = (found / "light.txt").read_text().splitlines()
+    assert "The light that object 1 had is not known: it keeps its mean brightness." in notes
+    old = [next(note for note in notes if f"object {number} comes from" in note) for number in (2, 3)]
+    assert old[0].replace("object 2", "object 3") == old[1]
+    strange, one, other = read_gaussians(found / "scene.ply").sh[-3 * ball().count :, 0].chunk(3)
+    kept, lost, also_lost = (float((colors - ball().sh[:, 0]).mean()) for colors in (strange, one, other))
+    # the target is bright, the source was dark; another place 0.4 away changes little
+    assert lost > 0.05
+    assert also_lost == pytest.approx(lost, rel=0.15)
+    # the mean is kept in linear light, not in sRGB
+    assert abs(kept) < 0.2 * lost
 
 
 def test_the_lights_of_both_places_are_drawn_past_an_object_without_gaussians(tmp_path: Path):

@@ -68,6 +68,7 @@ def test_the_report_begins_with_all_warnings_of_the_run(
 ) -> None:
     # the object stands where nothing was captured, so that there is no light to be found
     warned = copy_project() / "project.toml"
+    warned.write_text(warned.read_text().replace('light = "off"', 'light = "transfer"'))
     far = Similarity(1.0, torch.eye(3), torch.tensor([500.0, 0.0, 0.0]))
     write_placement(warned.parent / "placement.json", Placement(objects=(ObjectPlacement(target_from_object=far),)))
     assert main(["run", str(warned)]) == 0
@@ -75,7 +76,7 @@ def test_the_report_begins_with_all_warnings_of_the_run(
     layout = read_flow(warned).layout
     relit = read_record(layout.relit)
     assert relit is not None
-    assert [warning for warning in relit.warnings if "It is pasted as it is." in warning.text]
+    assert [warning for warning in relit.warnings if "is pasted as it is." in warning.text]
     page = (layout.report / "index.html").read_text()
     top = page.split('<section class="warnings">')[1].split("</section>")[0]
     assert page.index('<section class="warnings">') < page.index('<section id="viewer"')
@@ -90,7 +91,7 @@ def test_the_report_begins_with_all_warnings_of_the_run(
     assert "stale" not in capsys.readouterr().out
     # a report that lacks a warning is stale
     step_file = layout.relit / "step.json"
-    step_file.write_text(step_file.read_text().replace("It is pasted", "It was pasted"))
+    step_file.write_text(step_file.read_text().replace("is pasted as", "was pasted as"))
     assert main(["status", str(warned)]) == 0
     stale = [line for line in capsys.readouterr().out.splitlines() if "stale" in line]
     assert [line.split()[0] for line in stale] == ["evaluate"]

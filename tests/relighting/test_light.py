@@ -21,9 +21,10 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.relighting.captured_scene import CapturedScene
+from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
-from splatgraft.relighting.light.light import Light, fit_ambient
+from splatgraft.relighting.light.light import Light, LightSource, fit_ambient, light_confidence
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
     Surroundings,
@@ -77,7 +78,7 @@ def test_light_is_seen_in_its_direction_in_linear_light():
     seen = render_panorama(scene, torch.zeros(3), size=32)
     assert seen.coverage > 0.99
     above = seen.radiance[seen.directions[..., 2] > 0.3]
-    # blends only like with like away from the border; alpha near 1 leaves 8 bits of float noise
+    # away from the border only equal colours are blended; alpha near 1 leaves 8 bits of float noise
     assert (above - linear_from_srgb(torch.tensor([0.9, 0.6, 0.3]))).abs().max() < 2e-3
 
 
@@ -145,7 +146,7 @@ def rough(looks, sun):
 
 
 def table(sun, gloss, reflected=polished):
-    """A plane whose harmonics of degree 3 hold a diffuse gray and what it reflects of `sun`."""
+    """A plane with a diffuse gray and a reflection of `sun` in harmonics of degree 3."""
     generator = torch.Generator().manual_seed(0)
     points = torch.cat([(torch.rand(3000, 2, generator=generator) - 0.5) * 2, torch.zeros(3000, 1)], 1)
     looks = even_directions(600)
@@ -183,7 +184,7 @@ def test_highlights_on_a_bare_table_give_the_direction(azimuth):
     assert math.degrees(math.acos(float(best @ sun))) < 12
     assert float(explained.max()) > 0.5
     assert float(explained[7]) == pytest.approx(evidence.explained(single[7]), abs=1e-4)
-    # a light beside it changes the share as when it is computed anew
+    # the share with an added light equals the share computed anew
     index = torch.arange(0, len(single), 20)
     both = 2 * single[explained.argmax()] + 3 * single[index]
     more = evidence.explained_with_more(2 * single[explained.argmax()], index, 3 * torch.ones(len(index)))
@@ -191,14 +192,14 @@ def test_highlights_on_a_bare_table_give_the_direction(azimuth):
 
 
 def test_a_rough_table_gives_the_height_of_a_sun_though_it_is_brightest_at_flat_views():
-    """Along the mirrored direction alone the sun is found 14 degrees too low."""
+    """A lobe about the mirrored direction alone finds the sun 14 degrees too low."""
     sun = towards(50, 1.0)
     best = DIRECTIONS[explained_by_each(evidence_of(table(sun, gloss=0.6, reflected=rough))).argmax()]
     assert math.degrees(math.acos(float(best @ sun))) < 12
 
 
 def test_each_material_has_its_own_gloss():
-    """One gloss for all explains what the glossy half shows by half, as the matt half denies it."""
+    """A common gloss would explain only half of the highlights, because the matt half has none."""
     sun = towards(38, 1.0)
     glossy = table(sun, 0.4).select(torch.arange(1500))
     matt = table(sun, 0.0).select(torch.arange(1500, 3000))
@@ -212,7 +213,7 @@ def test_each_material_has_its_own_gloss():
 def test_matt_tables_and_flat_colours_have_no_highlights():
     scene = table(UP, gloss=0.0)
     evidence = find_highlights(CapturedScene(scene, high_views()), region=REGION)
-    # what is left is the rounding of float32, 1e-5
+    # only the rounding of float32 remains, 1e-5
     assert evidence is None or evidence.variance < 1e-10
     assert find_highlights(CapturedScene(scene.with_sh_degree(0), high_views()), region=REGION) is None
 
@@ -235,7 +236,7 @@ def receivers(points: torch.Tensor, visibility: torch.Tensor | None = None) -> S
 
 
 def surroundings(clipped: torch.Tensor) -> Surroundings:
-    """All seen, gray but for what is clipped, and far away."""
+    """Distant gray surroundings, all seen, with clipped directions."""
     radiance = torch.where(clipped > 0, 1.0, 0.3)[:, None].repeat(1, 3)
     return Surroundings(radiance, torch.ones(COUNT), clipped, DIRECTIONS, torch.full((COUNT,), 1e4))
 
@@ -282,7 +283,7 @@ def test_a_window_above_its_reflection_on_a_table_may_be_a_source():
 
 
 def views(levels=(0.0,)):
-    """Twelve cameras on one circle, for each level that they look at."""
+    """Twelve cameras on one circle for each level of their focus."""
     eyes = ring().centers
     poses = torch.cat([look_at(eyes, torch.tensor([0.0, 0.0, level]), UP) for level in levels])
     return pinhole(poses, 100.0, width=128, height=96)
@@ -296,7 +297,7 @@ def estimated(scene, cameras=None) -> Light:
 
 
 def main_direction(light):
-    """Of most irradiance."""
+    """Normal of the plane with the largest irradiance."""
     normals = even_directions(2000)
     return normals[light.irradiance(normals).sum(1).argmax()]
 
@@ -305,9 +306,9 @@ def main_direction(light):
 def test_shadows_give_the_direction_of_a_sun_that_no_camera_saw(azimuth):
     sun = torch.nn.functional.normalize(torch.tensor([0.78 * math.cos(azimuth), 0.78 * math.sin(azimuth), 0.8]), dim=0)
     light = estimated(sunlit_scene(sun, strength=3.0))
-    # the shadows are three texels' width off their true edge at most, of some fifteen that a ball is high
+    # edges of shadows are off by at most three texels, and a ball is about fifteen texels high
     assert degrees_apart(torch.tensor(light.sources[0].direction), sun) < 3
-    # by the shadows 3 cos of the sky's light; found too low, as Gaussians mix lit and shaded floor at the edges
+    # the shadows show 3 cos of the sky's light; the estimate is too low: Gaussians mix lit and shaded floor at edges
     on_floor = light.irradiance(UP[None]).mean()
     share = sum(light.sources[0].irradiance) / 3 * light.sources[0].direction[2] / on_floor
     assert float(share) == pytest.approx(3 * float(sun[2]) / (1 + 3 * float(sun[2])), abs=0.1)
@@ -331,7 +332,7 @@ def sun_of(scene):
 def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s_edge_shows():
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     scene, tops = sunlit_scene(sun, 3.0), torch.tensor([[1.0, 0.2, 0.5], [-0.6, 0.9, 0.5]])
-    # named a little beside where they are
+    # the casters are marked slightly off
     off = torch.tensor([0.02, -0.01, 0.0])
     points = [tuple(at.tolist()) for top in tops for at in (top + off, top - sun * top[2] / sun[2])]
     found = set_sun(points, CapturedScene(scene, views()))
@@ -415,7 +416,18 @@ def test_what_shadows_alone_show_is_named_by_where_it_may_be(height, name):
     sun = torch.nn.functional.normalize(torch.tensor([0.3, 0.3, height]), dim=0)
     light = estimated(sunlit_scene(sun, strength=3.0), views((0.0, 1.5)))
     assert light.sources[0].name == name
-    assert f"{name} " in light.describe(UP)
+    assert f"{name} " in describe_light(light, UP)
+
+
+@pytest.mark.parametrize(("uncertainty_deg", "is_doubted"), [(14.0, False), (17.0, True)])
+def test_a_direction_is_called_uncertain_from_15_degrees_on(uncertainty_deg, is_doubted):
+    source = LightSource((0.0, 0.0, 1.0), (1.0, 1.0, 1.0), uncertainty_deg=uncertainty_deg)
+    light = Light((source,), fit_ambient(torch.tensor([0.2, 0.2, 0.2])))
+    assert ("its direction is uncertain" in describe_light(light, UP)) == is_doubted
+    # the confidence has a scale of its own, 20 degrees
+    sun, rest = source.luminance, math.pi * 0.2
+    expected = (rest + sun * math.exp(-((uncertainty_deg / 20) ** 2))) / (rest + sun)
+    assert light_confidence(light) == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("strength", [0.0, 1.0])
@@ -500,7 +512,7 @@ def test_values_that_are_not_finite_or_huge_leave_the_light_finite(field, value)
 @pytest.mark.long
 def test_the_light_of_a_room_is_the_same_from_two_runs_of_poses(tmp_path):
     pytest.importorskip("pycolmap")
-    # of the shipped ones, half as large, fewer get a pose
+    # the shipped photos are half as large, so fewer of them get a pose
     photos = Path(__file__).parents[3] / "shared" / "data" / "bananas" / "images"
     if not photos.is_dir():
         pytest.skip(f"no {photos}")

@@ -20,6 +20,7 @@ from splatgraft.formats import is_scene, read_cameras, read_gaussians
 from splatgraft.project.layout import CAMERAS_FILE, PROJECT_FILE, SCENE_FILE
 from splatgraft.project.step import Positional
 from splatgraft.relighting.captured_scene import CapturedScene
+from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import environment_radiance, equirectangular_directions, estimate_light
 from splatgraft.relighting.light.light import Light, light_to_json
 from splatgraft.relighting.light.panorama import NoLight
@@ -91,7 +92,9 @@ class LightAt:
         lamps = self.out.with_suffix(".json")
         with atomic_write(lamps) as stream:
             stream.write(light_to_json(light, world_from_capture=turn).encode())
-        console.say(f"The light at {', '.join(f'{v:.3g}' for v in place.center.tolist())}: {light.describe(up)}.")
+        console.say(
+            f"The light at {', '.join(f'{v:.3g}' for v in place.center.tolist())}: {describe_light(light, up)}."
+        )
         console.result(self.out)
         console.result(lamps)
         return 0

@@ -81,8 +81,8 @@ class ProjectFiles:
     """Whether source and target are scenes without photographs, whose images are rendered from the scene."""
     rendered_views: tuple[RenderedViews, RenderedViews]
     """How the images of source and target are rendered, where they are scenes without photographs."""
-    light_mode: Literal["transfer", "gain", "off"]
-    """`light` of [relight]: the physical transfer, a gain of the object alone, or nothing."""
+    light_mode: Literal["transfer", "off"]
+    """`light` of [relight]: the physical transfer, or nothing."""
     relight_options: RelightOptions
     """`options` of [relight]."""
     place_options: PlaceOptions

@@ -24,7 +24,6 @@ from splatgraft.editor.state import EditState
 from splatgraft.relighting import Light, RelightOptions, Relit, SourceScene
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.cast_shadows import cast_shadows
-from splatgraft.relighting.gain import relight_by_gain
 from splatgraft.relighting.layers import assemble_layers, pasted
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.prepared_object import PreparedObject, find_source_light, prepare_object
@@ -235,8 +234,6 @@ class RelitPreview:
         composite, light_mode = self._scenes.composite(state), self._scenes.files.light_mode
         if light_mode == "off":
             return self.pasted(composite)[0]
-        if light_mode == "gain":
-            return self._memo.get("gain adjusted", (composite,), lambda: self._gain_adjusted(composite, state))
         relit = self.layers(state, draft=draft)
         return self._memo.get("scene", (relit, state.weights), lambda: relit.bake(state.weights)[0])
 
@@ -253,12 +250,7 @@ class RelitPreview:
         light_mode = self._scenes.files.light_mode
         if light_mode == "transfer":
             return ""
-        described = {"gain": "exposure and white balance of the object alone", "off": "nothing: the object as captured"}
-        return f"{described[light_mode]}, as set in project.toml ([relight] light = {light_mode})"
-
-    def _gain_adjusted(self, composite: Composite, state: EditState) -> Gaussians:
-        adjusted, _ = relight_by_gain(composite, self._cameras(), sources=self._scenes.source_scenes(state))
-        return adjusted.bake()[0]
+        return f"nothing: the object as captured, as set in project.toml ([relight] light = {light_mode})"
 
     def _make_once(
         self, name: str, state: EditState, make: Callable[[], Relit], *, lock: AbstractContextManager[object]

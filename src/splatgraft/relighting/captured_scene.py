@@ -1,6 +1,6 @@
-"""A scene with the cameras of its capture: what they see of it, drawn when it is first asked for and then kept.
+"""A scene with the cameras of its capture; normals and views are computed at first use and kept.
 
-Of all that the light at a place is found from, this alone does not depend on the place.
+These are the only inputs of the light estimate that do not depend on the place.
 """
 
 from dataclasses import dataclass, replace
@@ -16,10 +16,8 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.relighting.normals import Normals, estimate_normals
 from splatgraft.rendering import Render, render
 
-_VIEWS, _VIEW_PX = 16, 480
-"""Cameras, spread over the list, and the longest side of what is drawn in them, pixels; set by hand."""
-_NEAREST = 1e-6  # world units in front of a camera; what is nearer is not drawn
-_HUGE = 1e6  # world units, and units of colour; larger Gaussians are a format's or an optimiser's fault
+_NEAREST = 1e-6  # world units; minimum depth of a Gaussian that has a nearness
+_HUGE = 1e6  # world units, and units of colour; larger Gaussians come from errors of formats or optimisers
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,23 +25,22 @@ class CapturedScene:
     """The n Gaussians of a scene and the cameras of its capture."""
 
     gaussians: Gaussians
-    """All of them."""
     cameras: Cameras
 
     @cached_property
     def up(self) -> Float[Tensor, "3"]:
-        """Unit."""
+        """Unit up direction, estimated from the cameras."""
         return estimate_up(self.cameras)
 
     @cached_property
     def usable(self) -> "CapturedScene":
-        """With the Gaussians alone whose values are finite and no larger than any camera or scene makes them."""
+        """The scene without Gaussians whose values are not finite or absurdly large."""
         good = _are_usable(self.gaussians)
         return self if bool(good.all()) else CapturedScene(self.gaussians.select(good), self.cameras)
 
     @cached_property
     def normals(self) -> Normals:
-        """Of all Gaussians, towards the cameras; without any confidence where a Gaussian is not usable."""
+        """Normals of all Gaussians, towards the cameras; unusable Gaussians have confidence 0."""
         if self.usable is self:
             return estimate_normals(self.gaussians, self.cameras, views=self.views)
         good, found = _are_usable(self.gaussians), self.usable.normals
@@ -57,12 +54,12 @@ class CapturedScene:
 
     @cached_property
     def views(self) -> tuple[tuple[Cameras, Render], ...]:
-        """Colour and depth of the scene in some of the cameras, each with one view.
+        """Single cameras, up to 16 spread over the list, with colour and depth of the scene at up to 480 pixels.
 
-        The depth is the inverse of the mean nearness: what is far behind a surface that lets a little light through
-        hardly moves it.
+        The depth is the inverse of the mean nearness, so that distant Gaussians seen through a slightly transparent
+        surface hardly change it.
         """
-        return tuple((one, self._drawn(one)) for one in self.cameras.spread(_VIEWS).limited(_VIEW_PX))
+        return tuple((one, self._drawn(one)) for one in self.cameras.spread(16).limited(480))
 
     def _drawn(self, camera: Cameras) -> Render:
         pose = camera.camera_from_world[0]
@@ -73,7 +70,7 @@ class CapturedScene:
         return replace(drawn, pictures={"color": drawn.color, "depth": depth})
 
     def with_object(self, thing: Gaussians) -> "CapturedScene":
-        """With an object that stands in it; its Gaussians come last."""
+        """Add the Gaussians of an object after those of the scene."""
         return CapturedScene(concatenate([self.gaussians, thing]), self.cameras)
 
 

@@ -14,6 +14,7 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
 from splatgraft.core.splitting import split_wide_around
 from splatgraft.relighting.cast_shadows import Shadows
+from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import EstimatedLight
 from splatgraft.relighting.light.light import Light, light_confidence
 from splatgraft.relighting.materials import gloss_bands, reflected_light
@@ -237,7 +238,7 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
 def _light_note(scene: SceneLight) -> Note:
     """What the light at the new place is, and whether most of it is a guess."""
     end = "." if scene.estimate is not None else ", as given."
-    text = f"At the new place: {scene.light.describe(scene.captured.up)}{end}"
+    text = f"At the new place: {describe_light(scene.light, scene.captured.up)}{end}"
     certain = light_confidence(scene.light)
     if certain >= _MIN_CERTAIN:
         return Note(text)

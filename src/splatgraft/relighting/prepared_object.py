@@ -17,6 +17,7 @@ from splatgraft.core.composite import PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting.captured_scene import CapturedScene
+from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.light import Light, LightSource
 from splatgraft.relighting.light.panorama import NoLight
@@ -162,7 +163,7 @@ def prepare_object(
     elif source is not None and source_light is not None:
         estimate = source_light if isinstance(source_light, EstimatedLight) else None
         old = source_light.light if isinstance(source_light, EstimatedLight) else source_light
-        described = old.describe(estimate_up(source.cameras)) + ("." if estimate is not None else ", as given.")
+        described = describe_light(old, estimate_up(source.cameras)) + ("." if estimate is not None else ", as given.")
         old = old.rotated(placed.target_from_object.rotation)
         old_samples = sample_light(old)
         shares = self_visibility(maps, gaussians, normals.vectors, old_samples)

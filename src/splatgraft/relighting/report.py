@@ -1,7 +1,7 @@
-"""What a transfer shows beside its result: pictures of the estimated lights, and a check of their level.
+"""Pictures of the estimated lights, and a check of their level against the exposure of the photos.
 
-The check compares the estimated change of illuminance with that of the photos' luminance: exposure metadata gives both
-captures absolute units. The ratio that is applied to the object is in each capture's own units, whatever it says.
+Exposure metadata gives both captures absolute units, so the estimated change of illuminance can be compared with the
+change of the photos' luminance. The check changes no result: the ratio applied to the object is in relative units.
 """
 
 import math
@@ -22,32 +22,29 @@ from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import cube_pixels, nearest_directions, render_panorama
 from splatgraft.runtime.note import Note
 
-# when a level is doubtful; set by hand
-_MAX_DIFFERENCE = 1.5
-"""Stops. The mean reflectance of what a capture shows is mostly from 0.1 to 0.5: of two, at most about 2.3 stops apart,
-and seldom more than this."""
-_MAX_LUX = 200_000.0  # sun and clear sky give up to 130,000; the rest is the error of cameras' speeds
+# doubtful levels; set by hand
+_MAX_DIFFERENCE = 1.5  # stops; mean reflectances of captures, mostly .1 to .5, seldom differ by more
+_MAX_LUX = 200_000.0  # sun and clear sky give up to 130,000; the rest allows for errors of the cameras' speeds
 
 # pictures
 _HEIGHT = 256  # pixels of the panorama, which is twice as wide
-_FACE = 128  # pixels; width of a face of the cube map that is drawn
-_UNSEEN = torch.tensor([0.35, 0.35, 0.38])  # sRGB that directions without a photograph are mixed with
-_STOPS = 2.0
-"""Residual, in stops, of full colour: red where a surface is brighter than explained, blue where it is darker."""
+_FACE = 128  # pixels; face width of the cube map
+_UNSEEN = torch.tensor([0.35, 0.35, 0.38])  # sRGB of directions that were not photographed
+_STOPS = 2.0  # residual of full colour: red if a surface is brighter than explained, blue if it is darker
 _RED, _WHITE, _BLUE = torch.tensor([[0.8, 0.1, 0.1], [0.92, 0.92, 0.92], [0.1, 0.25, 0.8]])
 
 
 def describe_level(relit: Relit, *, target: LuminanceScale, source: LuminanceScale) -> tuple[Note, ...]:
-    """Compare how much brighter the new place is by the photos and by the light on each object, before any share.
+    """Compare the change of light from the old to the new place by the photos with that by the estimated lights.
 
     Args:
         relit: A transfer.
-        target: Of the target's photos.
-        source: Of the photos that all objects of known source light come from.
+        target: Luminance scale of the target's photos.
+        source: Luminance scale of the source's photos, from which all objects with a known light come.
 
     Returns:
-        A note per object of known source light, a warning where the two do not agree or where there is more light than
-        under the sun; none where a photo shows no light.
+        One note for each object with a known source light. It is a warning if the two disagree or if there is more
+        light than under the sun. No notes if the photos of one capture are black.
     """
     if min(target.mean, source.mean) <= 0:
         return ()
@@ -72,12 +69,14 @@ def _level_note(number: int, by_photos: float, *, new: float, old: float) -> Not
     doubts = ""
     if abs(by_light - by_photos) > _MAX_DIFFERENCE:
         doubts += (
-            f" They differ by {abs(by_light - by_photos):.1f} stops: one of the lights may be wrong, or what the "
-            f"photos of the two places show differs as much in reflectance."
+            f" They differ by {abs(by_light - by_photos):.1f} stops: one of the lights may be wrong, or the surfaces "
+            f"in the photos of the two places differ as much in reflectance."
         )
     if max(new, old) > _MAX_LUX:
         doubts += " That is more than sun and sky give: the estimated light is too strong, or the metadata is wrong."
-    return Note(plain + doubts, "warning" if doubts else "said")
+    if not doubts:
+        return Note(plain)
+    return Note(plain + doubts, "warning", "If the object looks too bright or too dark, correct it (--exposure).")
 
 
 def _mean_luminance(irradiance: Float[Tensor, "n 3"], weights: Float[Tensor, "n"]) -> float:
@@ -90,17 +89,17 @@ def _brighter(stops: float) -> str:
 
 
 def _rounded(lux: float) -> str:
-    """Two digits: no camera is calibrated better."""
+    """Round to two digits, the precision of a camera's calibration."""
     return f"{float(f'{lux:.2g}'):,.6g}"
 
 
 def draw_light(found: EstimatedLight, scene: Gaussians, center: Float[Tensor, "3"]) -> Float[Tensor, "h w 3"]:
-    """The panorama at the place, sources circled, and beside it the surfaces from above, coloured by their residual.
+    """Draw the panorama at a place with circled sources, and beside it the surfaces from above coloured by residual.
 
     Args:
         found: The estimate.
         scene: All Gaussians, without the object.
-        center: The place, world units.
+        center: Middle of the place, world units.
 
     Returns:
         sRGB in [0, 1].
@@ -116,7 +115,8 @@ def _panorama(
     turn = 2 * math.pi * ((torch.arange(2 * _HEIGHT) + 0.5) / (2 * _HEIGHT) - 0.5)[None]
     flat = torch.stack([height.cos() * turn.cos(), height.cos() * turn.sin(), height.sin() + 0 * turn], -1)
     directions = (flat @ frame).reshape(-1, 3)
-    nearest = 0.25 * float((found.evidence.surfaces.points - center).norm(dim=1).median()) if _has(found) else 0.0
+    points = found.evidence.surfaces.points
+    nearest = 0.25 * float((points - center).norm(dim=1).median()) if len(points) else 0.0
     cube = render_panorama(scene, center, size=_FACE, nearest=nearest)
     shown = srgb_from_linear(cube.radiance.reshape(-1, 3)[cube_pixels(directions, _FACE)].clamp(0, 1))
     seen = found.evidence.around.seen[nearest_directions(directions)][:, None]
@@ -140,10 +140,10 @@ def _circle(canvas: np.ndarray, source: LightSource, frame: Float[Tensor, "3 3"]
 
 def _surfaces(found: EstimatedLight, center: Float[Tensor, "3"], frame: Float[Tensor, "3 3"]) -> Float[Tensor, "h h 3"]:
     canvas = np.full((_HEIGHT, _HEIGHT, 3), 30, np.uint8)
-    if not _has(found):
+    points = found.evidence.surfaces.points
+    if not len(points):
         return torch.from_numpy(canvas).float() / 255
-    surfaces = found.evidence.surfaces
-    places = (surfaces.points - center) @ frame.T
+    places = (points - center) @ frame.T
     reach = float(places[:, :2].abs().max())
     stops = (found.hidden.residual / math.log(2) / _STOPS).clamp(-1, 1)[:, None]
     colors = torch.where(stops > 0, _WHITE + stops * (_RED - _WHITE), _WHITE - stops * (_BLUE - _WHITE))
@@ -152,7 +152,3 @@ def _surfaces(found: EstimatedLight, center: Float[Tensor, "3"], frame: Float[Te
         x, y = pixels[i].tolist()
         cv2.circle(canvas, (x, _HEIGHT - 1 - y), 3, (colors[i] * 255).tolist(), -1, cv2.LINE_AA)
     return torch.from_numpy(canvas).float() / 255
-
-
-def _has(found: EstimatedLight) -> bool:
-    return len(found.evidence.surfaces.points) > 0

@@ -1,10 +1,10 @@
 """The light at the objects' place in a scene, and the Gaussians there that may receive their shadows.
 
-All of it holds while the objects move by less than half of the shadow maps' radius (`SceneLight.moved`).
+Shadow maps and sources are valid while the objects move by less than half of the maps' radius (`SceneLight.moved`).
 
-Where the scene's main light is visibly blocked by what was never captured, the scene's own brightness shows it:
-sunlight through a window lights a patch of a table; the depth maps lack the window's frame, but the table's colours
-show the patch. Brightness is compared within groups of one material, then smoothed over neighbours.
+Uncaptured things may block the scene's main light: sunlight through a window lights a patch of a table, but the
+window's frame is missing from the shadow maps. The table's colours show the patch. So the visibility of the main light
+is also measured from brightness, which is compared within groups of one material and smoothed over neighbours.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.relighting.captured_scene import CapturedScene
-from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light, with_source_distances
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light, with_blocker_distances
 from splatgraft.relighting.light.evidence import group_materials
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama import NoLight
@@ -32,20 +32,16 @@ from splatgraft.relighting.shadows.receivers import RIM, Receivers, above_layer,
 from splatgraft.relighting.shadows.scene_ratio import SceneShadowMaps, reachable, scene_shadow_maps, scene_visibility
 
 # the region of the shadow maps; set by hand
-_MARGIN = 1.2  # radius of a new region over what the objects need
-_KEPT_RADII = (0.8, 2.0)  # minimum and maximum radius of a region that is kept, over what the objects need
-_KEPT_SHIFT = 0.5  # radii of a region by which the objects' place may be off its centre
+_MARGIN = 1.2  # radius of a new region over the required one
+_KEPT_RADII = (0.8, 2.0)  # minimum and maximum radius of a region that is kept, over the required one
+_KEPT_SHIFT = 0.5  # maximum distance of the objects' place from the centre of a kept region, in its radii
 
-# when brightness shows whether the main light arrives; set by hand
-_SMOOTHED = 64  # gaussians over which the median is taken
-_CONTRAST = 0.5  # irradiance of the light over that of the rest; with less, brightness shows nothing
-_FAINTEST = 0.1  # opacity below which a Gaussian is left out
-_MIN_GAUSSIANS = 500  # with fewer nothing is estimated
-_DARKEST = 0.01  # sRGB; darker channels count as this
-_LIT_QUANTILE = 0.75
-"""Quantile of apparent albedo in a group of one material: a Gaussian of this brightness is taken to be fully lit."""
-_RAMP_START, _RAMP_WIDTH = 0.2, 0.4
-"""Start and width of the ramp from 0 to 1 over the measured visibility: little light counts as none."""
+# visibility of the main light from brightness; set by hand
+_SMOOTHED = 64  # gaussians in the median
+_CONTRAST = 0.5  # minimum irradiance of the main light over that of the rest; with less, brightness does not show it
+_MIN_GAUSSIANS = 500  # with fewer the visibility is not measured
+_LIT_QUANTILE = 0.75  # quantile of apparent albedo in a group that counts as the albedo of fully lit Gaussians
+_RAMP_START, _RAMP_WIDTH = 0.2, 0.4  # ramp from 0 to 1 over the measured visibility: faint light counts as none
 
 
 @dataclass(frozen=True)
@@ -53,30 +49,30 @@ class SceneLight:
     """The light of a scene at the place of objects, and the m receivers of their shadows."""
 
     captured: CapturedScene
-    """All Gaussians that are not erased."""
+    """Scene without erased Gaussians."""
     light: Light
-    """At the objects' place."""
+    """Light at the objects' place."""
     estimate: EstimatedLight | None
-    """What `light` rests on; None where it was given."""
+    """Estimate that `light` comes from; None if the light was given."""
     samples: LightSamples
     """k samples of `light`."""
     maps: SceneShadowMaps
     """The scene's own shadow maps for the samples."""
     receivers: Receivers
-    """The Gaussians that the objects may reach, from where they were and after a move by up to their radius."""
+    """Gaussians that the objects' shadows may reach, even after a move by up to an object's radius."""
     receivers_of: tuple[BoundingSphere, ...]
-    """The objects' bounding spheres when the receivers were chosen."""
+    """Bounding spheres of the objects for which the receivers were chosen."""
     reach: float
-    """Object radii to which shadows are computed."""
+    """Maximum length of shadows, object radii."""
 
     def moved(self, spheres: Sequence[BoundingSphere]) -> "SceneLight | NoLight | None":
-        """Its sources and shadow maps with the objects at other places, and the ambient light there.
+        """Move the objects: keep sources and shadow maps, and compute the ambient light at the new place.
 
         Args:
-            spheres: Of the objects.
+            spheres: The objects' new bounding spheres.
 
         Returns:
-            None where the objects are too far from the maps' middle, or need larger or much smaller maps.
+            None if the objects are too far from the maps' middle, or need larger or much smaller maps.
         """
         place, region = place_of(spheres), self.maps.region
         least, most = (factor * place.radius * self.reach for factor in _KEPT_RADII)
@@ -110,11 +106,14 @@ def find_scene_light(
     """Find the light of a scene at the place of objects.
 
     Args:
-        captured: All Gaussians that are not erased.
-        spheres: Of the objects, at least one.
-        light: At the objects' place, its sources seen from there; None to estimate it.
-        reach: Object radii to which shadows are computed.
-        sun_through: Points and their shadows, as for `light.sun.set_sun`: an estimate has this sun.
+        captured: The scene without erased Gaussians.
+        spheres: Bounding spheres of the objects, at least one.
+        light: A given light, with sources as seen from the objects' place; None to estimate it.
+        reach: Maximum length of shadows, object radii.
+        sun_through: Points and their shadows, as for `light.sun.set_sun`, from which an estimate takes its sun.
+
+    Returns:
+        The light, or the reason why there is none.
     """
     place, scene = place_of(spheres), captured.gaussians
     estimate = None
@@ -124,7 +123,7 @@ def find_scene_light(
             return found
         estimate, light = found, found.light
     else:
-        light = with_source_distances(light, scene, place)
+        light = with_blocker_distances(light, scene, place)
     samples = sample_light(light)
     maps = scene_shadow_maps(scene, BoundingSphere(place.center, _MARGIN * (place.radius * reach)), samples)
     receivers = _receivers(captured, spheres, light, maps)
@@ -132,7 +131,7 @@ def find_scene_light(
 
 
 def place_of(spheres: Sequence[BoundingSphere]) -> BoundingSphere:
-    """The middle of objects, and the radius of the largest."""
+    """Return the mean centre of bounding spheres with the radius of the largest."""
     center = torch.stack([sphere.center for sphere in spheres]).mean(0)
     return BoundingSphere(center, max(sphere.radius for sphere in spheres))
 
@@ -140,7 +139,7 @@ def place_of(spheres: Sequence[BoundingSphere]) -> BoundingSphere:
 def _receivers(
     captured: CapturedScene, spheres: Sequence[BoundingSphere], light: Light, maps: SceneShadowMaps
 ) -> Receivers:
-    """Gaussians that the objects may reach from where they are, and after a move by up to their radius."""
+    """Select the Gaussians that the objects' shadows may reach, even after a move by up to an object's radius."""
     scene, region, samples = captured.gaussians, maps.region, sample_light(light)
     reached = torch.zeros(scene.count, dtype=torch.bool)
     rims = RIM * scene.scales.max(1).values
@@ -162,7 +161,7 @@ def _receivers(
 def _with_observed_light(
     gaussians: Gaussians, normals: Normals, light: Light, sample_visibility: Float[Tensor, "m k"]
 ) -> Float[Tensor, "m k"]:
-    """`sample_visibility` with the main source's reduced where the scene's colours show that it does not arrive."""
+    """Reduce the visibility of the main source for Gaussians whose colours show that it does not arrive."""
     if not light.sources:
         return sample_visibility
     samples, count = sample_light(light), main_source_samples(light)
@@ -177,13 +176,13 @@ def _with_observed_light(
 def _observed_visibility(
     gaussians: Gaussians, normals: Normals, *, rest: Float[Tensor, "m"], main: Float[Tensor, "m"]
 ) -> Float[Tensor, "m"]:
-    """Share of the main light that is visible in the colours of m Gaussians, in [0, 1]; 1 where unknown.
+    """Measure the visibility of the main light from the colours of m Gaussians, in [0, 1]; 1 if unknown.
 
-    `main` is its gray irradiance by geometry, `rest` that of all other light.
+    `main` is the gray irradiance of the main light by shadow maps, `rest` that of all other light.
     """
     share = torch.ones(gaussians.count)
-    brightness = linear_from_srgb(rgb_from_dc(gaussians.sh[:, 0]).clamp(_DARKEST, 1))
-    usable = (main > _CONTRAST * rest) & normals.seen & (gaussians.opacities > _FAINTEST)
+    brightness = linear_from_srgb(rgb_from_dc(gaussians.sh[:, 0]).clamp(0.01, 1))  # darker channels are noise
+    usable = (main > _CONTRAST * rest) & normals.seen & (gaussians.opacities > 0.1)
     index = usable.nonzero()[:, 0]
     if len(index) < _MIN_GAUSSIANS:
         return share
@@ -191,7 +190,7 @@ def _observed_visibility(
     value = brightness[index].mean(1)
     full, without = (rest + main)[index], rest[index]
     albedo = value / full
-    # a group without any lit Gaussian gets visibility 1 this way: no evidence
+    # a group without any lit Gaussian is no evidence and thus gets visibility 1
     lit_albedo = torch.zeros(int(groups.max()) + 1)
     for group in range(len(lit_albedo)):
         inside = groups == group

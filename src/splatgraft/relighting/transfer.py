@@ -1,8 +1,12 @@
 """Physically based light transfer: objects placed in a scene get shading, shadows, bounce and gloss in layers.
 
-Differential rendering (Debevec 1998) on Gaussians: the light at the old and the new place is estimated, and colours are
-multiplied by ratios of irradiance. No training, no rendered views. Four values are made one after another, each by one
-call: the light of the scene, the prepared objects, their shadows, and the result in layers.
+Differential rendering (Debevec 1998) on Gaussians, without training: the light at the old and the new place is
+estimated, and colours are multiplied by ratios of irradiance. Each step is one call and makes one value:
+
+1. `find_scene_light`: the light of the target at the objects' place.
+2. `prepare_object`: each object's normals, materials and old light.
+3. `cast_shadows`: the shadows and the bounce of the objects.
+4. `assemble_layers`: the composite with its change of light in layers.
 """
 
 from collections.abc import Sequence
@@ -20,29 +24,27 @@ from splatgraft.relighting.light.sun import Point
 from splatgraft.relighting.prepared_object import SourceLight, SourceScene, find_source_light, prepare_object
 from splatgraft.relighting.scene_light import find_scene_light
 
-_MIN_BUDGET = 40_000
-"""Gaussians that splitting may add to any scene: enough for the edges of one shadow on a surface of many layers; set by
-hand."""
-
 
 @dataclass(frozen=True)
 class RelightOptions:
-    """Reach of a transfer and the number of Gaussians it may add."""
+    """Length of shadows, sun, and number of Gaussians that may be added."""
 
     reach: float = 8.0
-    """Shadows are computed up to this many object radii from the object."""
+    """Maximum length of shadows, object radii from the object."""
     most_added: float = 0.3
-    """At most this share of the composite's Gaussians is added by splitting, or 40,000 where that is more; 0: none."""
+    """Maximum number of Gaussians added by splitting, as a share of the composite's Gaussians; a maximum below 40,000
+    is raised to it, but 0 adds none."""
     fitted_views: int = 8
-    """Views of the target in which shadows are fitted to the surface that is seen, and what is behind it is shaded;
-    0: none, for a quick draft."""
+    """Number of views of the target in which shadows are fitted to the visible surface, and in which Gaussians seen
+    through it are shaded; 0 skips both, for a quick draft."""
     sun_through: tuple[Point, ...] = ()
-    """Points of the target in pairs, world units: one that casts a shadow, then the same point of its shadow. The
-    estimated light gets the sun that goes through them; several pairs are averaged. Of no effect on a given light."""
+    """Points of the target in pairs, world units: a point that casts a shadow, then the same point of its shadow. The
+    estimated light gets the sun of this direction; several pairs are averaged. A given light ignores it."""
 
     def budget(self, count: int) -> int:
-        """Gaussians that splitting may add to a composite of `count`."""
-        return max(int(self.most_added * count), _MIN_BUDGET) if self.most_added > 0 else 0
+        """Return the number of Gaussians that splitting may add to a composite of `count`."""
+        # 40,000 are enough for the edges of one shadow on a surface of many layers; set by hand
+        return max(int(self.most_added * count), 40_000) if self.most_added > 0 else 0
 
 
 def relight(
@@ -59,18 +61,19 @@ def relight(
 
     Args:
         composite: The target with the objects placed in it.
-        cameras: The target's cameras; from them follows the up direction.
-        sources: For every object the scene that it was taken from, without the object, whose light is divided out;
-            None, or no sources at all, where it is not known: the object then keeps its mean brightness.
-        light: The light at the place of the objects; estimated from the target where not given.
-        options: How far shadows reach and how many Gaussians may be added.
+        cameras: The target's cameras, which also give the up direction.
+        sources: For each object the scene that it was taken from, without the object; its light is divided out. None
+            if the scene is unknown, or no sources at all: the object then keeps its mean brightness.
+        light: The light at the objects' place; None to estimate it from the target.
+        options: Length of shadows, sun, and number of Gaussians that may be added.
 
     Returns:
-        The composite with its change of light in layers. Where no light can be estimated the layers change nothing
-        and `report` gives the reason.
+        The composite with its change of light in layers. If no light can be estimated, the layers change nothing and
+        `report` gives the reason.
 
     Raises:
-        ValueError: `sources` is neither empty nor one per object, or gives normals of another number of Gaussians.
+        ValueError: The number of `sources` is neither 0 nor that of the objects, or the normals of a source do not fit
+            its object.
     """
     if len(sources) not in (0, len(composite.objects)):
         raise ValueError(f"relight: expected {len(composite.objects)} source scenes, found {len(sources)}")

@@ -15,6 +15,7 @@ from splatgraft.project.step import Context, Device, Inputs
 from splatgraft.relighting import SourceScene, relight
 from splatgraft.relighting.light.light import light_to_json
 from splatgraft.runtime.console import Console
+from splatgraft_paper.benchmark.gain import relight_by_gain
 from splatgraft_paper.benchmark.scene import ComposedScene, perform_if_stale
 from splatgraft_paper.benchmark.transplat import relight_by_irradiance_ratio
 from splatgraft_paper.benchmark.true_light import read_true_light
@@ -95,11 +96,11 @@ class Method:
 
 @dataclass(frozen=True)
 class RelightForBenchmark:
-    """A light transfer that only the benchmark has.
+    """A light transfer for comparison, which only the benchmark has.
 
-    With a light: the physical transfer with the true light instead of an estimate, an upper bound for the estimate.
-    Without: TranSplat's, which multiplies the object's colours by irradiance at its new place over that at its old one,
-    both from the scenes, and casts no shadow.
+    - gain: one factor for each object and channel, from the mean light around both places; no shadow.
+    - transplat: TranSplat's ratio of the irradiances at both places, for each normal; no shadow.
+    - true-light: the physical transfer with the true light instead of an estimate, an upper bound for the estimate.
     """
 
     target: Path
@@ -114,8 +115,10 @@ class RelightForBenchmark:
     """The source's."""
     out: Path
     """Folder for scene.ply."""
+    prior: Literal["gain", "transplat", "true-light"]
+    """The transfer."""
     light: Path | None = None
-    """light.json."""
+    """light.json of the true light."""
 
     def inputs(self) -> Inputs:
         """All files that are read."""
@@ -127,9 +130,12 @@ class RelightForBenchmark:
         """Make the relit composite."""
         source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
         composite = read_composite(self.target, self.placement)
-        if self.light is None:
+        if self.prior == "gain":
+            result, notes = relight_by_gain(composite, read_cameras(self.cameras), sources=[source])
+        elif self.prior == "transplat":
             result, notes = relight_by_irradiance_ratio(composite, sources=[source])
         else:
+            assert self.light is not None
             light, cameras = read_true_light(self.light), read_cameras(self.cameras)
             result = relight(composite, cameras, sources=[source], light=light)
             notes = result.report
@@ -196,15 +202,14 @@ def run_method(
 def _relit_scene(prior: Prior, scene: ComposedScene, console: Console) -> tuple[Path, float]:
     out = scene.work / "priors" / prior
     placement = scene.composite / PLACEMENT_FILE
-    if prior in ("true-light", "transplat"):
+    if prior in ("gain", "transplat", "true-light"):
         light = scene.light if prior == "true-light" else None
         if scene.surroundings is None or scene.source_cameras is None or (prior == "true-light" and light is None):
             raise ValueError(f"{scene.name}: {prior}: expected the object's capture and a true light, found none")
         step = RelightForBenchmark(
-            scene.target, placement, scene.cameras, scene.surroundings, scene.source_cameras, out, light
+            scene.target, placement, scene.cameras, scene.surroundings, scene.source_cameras, out, prior, light
         )
         return out / SCENE_FILE, perform_if_stale(step, console)
-    kind = "gain" if prior == "gain" else "transfer"
-    step = Relight(scene.target, placement, scene.cameras, out, light=kind)
+    step = Relight(scene.target, placement, scene.cameras, out)
     step = replace(step, surroundings=scene.surroundings, object_cameras=scene.source_cameras)
     return out / SCENE_FILE, perform_if_stale(step, console)

@@ -20,7 +20,7 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear, write_image
 from splatgraft.evaluation.measure import find_regions
 from splatgraft.relighting import Light, Relit, SourceScene, relight
-from splatgraft.relighting.gain import relight_by_gain
+from splatgraft_paper.benchmark.gain import relight_by_gain
 from splatgraft_paper.benchmark.measure import measure_view
 from splatgraft_paper.benchmark.transplat import relight_by_irradiance_ratio
 from splatgraft_paper.exam.scenes import ExamScene, TrueView

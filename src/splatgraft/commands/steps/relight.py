@@ -17,7 +17,6 @@ from splatgraft.project.gaussian_flags import write_flags
 from splatgraft.project.layout import IS_OBJECT_FILE, LIGHT_FILE, LIGHT_PICTURE, LIGHT_TEXT_FILE, SCENE_FILE
 from splatgraft.project.placement import read_placement
 from splatgraft.project.step import Context, Inputs
-from splatgraft.relighting.gain import relight_by_gain
 from splatgraft.relighting.layers import LayerWeights, Relit
 from splatgraft.relighting.light.light import Light, light_from_json, light_to_json
 from splatgraft.relighting.prepared_object import SourceScene
@@ -46,9 +45,8 @@ class Relight:
     """The source's cameras, likewise."""
     taken: Path | None = None
     """File of the object that was taken from the source, as the placement names it; the first where not given."""
-    light: Literal["transfer", "gain", "off"] = "transfer"
-    """transfer: shading and shadows; gain: exposure and white balance of the object alone; off: the object as it was
-    captured (the paper's configuration)."""
+    light: Literal["transfer", "off"] = "transfer"
+    """transfer: shading and shadows; off: the object as it was captured (the paper's configuration)."""
     given_light: Path | None = None
     """A light.json that replaces the estimate: one that an earlier run wrote, changed or not."""
     options: RelightOptions = field(default_factory=RelightOptions)
@@ -70,9 +68,6 @@ class Relight:
         if self.light == "off":
             gaussians, is_object = composite.bake()
             notes = (Note("The light transfer was off: the object is pasted as it was captured."),)
-        elif self.light == "gain":
-            adjusted, notes = relight_by_gain(composite, read_cameras(self.cameras), sources=self._sources())
-            gaussians, is_object = adjusted.bake()
         else:
             cameras, sources = read_cameras(self.cameras), self._sources()
             relit = relight(composite, cameras, sources=sources, light=self.given(), options=self.options)

@@ -1,12 +1,14 @@
-"""The light at a place of a scene, from its panorama there and from shadows and highlights on the surfaces around.
+"""Estimate of the light at a place of a scene from its panorama and from shadows and highlights on the surfaces around.
 
-Peaks of the radiance that explains them become sources, the rest ambient light of degree 2. Where shadows on the
-surface around the place show the sun (`sun.py`), it takes the place of the suns among them. A source that is seen from
-the place stands where the view towards it ends: nothing that the scene shows there blocks it, such as a window's pane.
+1. Collect the evidence: panorama, shading of surfaces, highlights.
+2. Find the radiance of 320 directions that explains it (`radiance_search.py`).
+3. Turn peaks of that radiance into sources, and the rest into ambient light of degree 2.
+4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it.
+5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
 
-The ambient light is also made an environment map for programs that light meshes: what cameras photographed as the scene
-shows it, in full resolution; the rest is the estimate's radiance, which has 320 directions. The estimate's sources are
-left out: their directions are as bright as what is around them.
+The ambient light is also available as an environment map for programs that light meshes. Photographed directions have
+the scene's own radiance in full resolution, all others the radiance of the estimate. Sources are left out: their
+directions get the radiance of their neighbours.
 """
 
 import math
@@ -44,77 +46,71 @@ from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, with_
 from splatgraft.rendering import render
 
 # the evidence; set by hand
-_OVERHEAD = 0.5  # cosine to the up direction of what counts as ceiling, 60 degrees
-_MIN_RADII, _MAX_RADII = 3.0, 8.0
-"""Object radii: limits of the radius of the region of evidence; between them it is the cameras' median distance."""
-_HIGHLIGHTS_WITHIN = 0.5  # radii of the region within which highlights count
-_FAR = 0.9  # radii of the region from which on light counts as coming from outside of it
+_MIN_RADII, _MAX_RADII = 3.0, 8.0  # object radii; bounds of the radius of the region of evidence
+_HIGHLIGHTS_WITHIN = 0.5  # radii of the region within which highlights are evidence
+_FAR = 0.9  # radii of the region beyond which a surface belongs to the distant surroundings
 
-# what is a source; none of these numbers is sensitive
+# sources; no result is sensitive to these numbers
 _OVER_MEDIAN = 4.0  # luminance of a peak over the median of all directions
-_MIN_SHARE = 0.02  # smallest share of all light that comes from one direction of a peak
+_MIN_SHARE = 0.02  # minimum share of one direction of a peak in all light
 _MAX_SOURCES = 4
-_NEIGHBOUR_COSINE = math.cos(math.radians(14))
-"""Cosine of the largest angle to the brightest direction at which a direction belongs to its source."""
+_NEIGHBOUR_COSINE = math.cos(math.radians(14))  # directions nearer to the brightest one belong to its source
 _SUN = 0.03  # steradians; a smaller clipped patch may show the sun, whose rays are parallel
-_LAMP = 0.64  # sine of the height from which a source in a room is a lamp, and below it a window
-_SEEN_NAMES, _UNSEEN_NAMES = ("window", "lamp"), ("sun or window", "sun or lamp")
-"""Of sources with a surface behind them, and of those that no picture shows: low ones and high ones."""
-_SAME_SOURCE = 0.94  # cosine between two sources from which they are one: 20 degrees
-_SKY = 0.5  # share of `FARTHEST` from which nothing stands behind a bright patch
+_LAMP = 0.64  # sine of the height above which a source in a room is named a lamp, otherwise a window
+_SEEN_NAMES = ("window", "lamp")  # low and high sources with a surface behind them
+_UNSEEN_NAMES = ("sun or window", "sun or lamp")  # low and high sources that no camera saw
 _UNSEEN_RADIUS_DEG = 1.0  # angular radius of a source that no camera saw, beside the uncertainty of its direction
-_HALF_BIN_DEG = 4.0  # error of a direction that is known to one of `DIRECTIONS` alone
-_CLIPPED_ERROR_DEG = 2.0  # error of the middle of a clipped patch
 
 # the view towards a source; set by hand
-_SOURCE_IMAGE = (32.0, 16)  # focal length and width, pixels, of the depth image
-_SOURCE_QUANTILE = 0.25  # quantile of the depths in that image that is the distance to the source
+_SOURCE_QUANTILE = 0.25  # quantile of the depths in that view that is the distance to the source
 _BLOCKERS_WITHIN = 0.7  # share of that distance within which occluders block the source
 
 # the environment map
-_SMOOTH_RAD = math.radians(8.0)
-"""Width of the kernel that interpolates between the estimate's directions, which are 11 degrees apart; set by hand."""
-_CHUNK = 65_536  # directions that are interpolated at a time
+_SMOOTH_RAD = math.radians(8.0)  # width of the kernel that interpolates between `DIRECTIONS`; set by hand
+_CHUNK = 65_536  # directions interpolated at a time; bounds memory
 
 
 @dataclass(frozen=True)
 class EstimatedLight:
-    """The light at a place of a scene, and what is needed to have it at places nearby."""
+    """The estimated light at a place of a scene, with the data to move it to places nearby."""
 
     mean: Light
-    """The mean over the posterior."""
+    """Mean over the posterior."""
     sun: Sun | None
-    """Where shadows show it; it then stands for the suns of `mean`."""
+    """Sun found from shadows, which replaces the distant sources of `mean`; None if shadows show none."""
     hidden: RadianceEstimate
-    """What no camera recorded."""
+    """Radiance that no camera recorded."""
     evidence: LightEvidence
-    """What the estimate rests on."""
+    """Evidence for the estimate."""
     place: BoundingSphere
-    """Where the sources were estimated."""
+    """Place at which the sources were estimated."""
 
     @property
     def light(self) -> Light:
-        """The estimate, with the sun that shadows show."""
+        """The estimate, including the sun that shadows show."""
         return self.mean if self.sun is None else with_sun(self.mean, self.sun)
 
     def rest(self) -> Float[Tensor, "k 3"]:
-        """Linear rgb radiance from all `DIRECTIONS` without the sources; `mean`'s ambient light is fitted to it."""
+        """Return the linear rgb radiance of all `DIRECTIONS` without the sources, to which ambient light is fitted."""
         return _split_peaks(self.hidden.radiance(self.evidence), self.evidence, within=math.inf)[1]
 
     def with_sun(self, sun: Sun, scene: Gaussians) -> "EstimatedLight":
-        """With another sun, which nothing blocks that `scene` shows where the view from the place towards it ends."""
+        """Replace the sun.
+
+        The surface of `scene` at which the view towards the sun ends, such as a window's pane, does not block it.
+        """
         named = replace(sun, name=sun.name or self._name_at(sun.direction))
-        placed = with_source_distances(with_sun(self.mean, named), scene, self.place)
+        placed = with_blocker_distances(with_sun(self.mean, named), scene, self.place)
         return replace(self, sun=replace(named, blockers_within=placed.sources[0].blockers_within))
 
     def _name_at(self, direction: Float[Tensor, "3"]) -> str:
-        """Of what shadows show in a direction: what pictures show there, or what may be there."""
-        shown = (s for s in self.mean.sources if float(torch.tensor(s.direction) @ direction.float()) > _SAME_SOURCE)
-        names = [source.name for source in shown if source.name in _SEEN_NAMES]
+        """Name a source found from shadows by a photographed one within 20 degrees, or by its possible kinds."""
+        near = (s for s in self.mean.sources if float(torch.tensor(s.direction) @ direction.float()) > 0.94)
+        names = [source.name for source in near if source.name in _SEEN_NAMES]
         return names[0] if names else _UNSEEN_NAMES[float(direction.float() @ self.evidence.up) > _LAMP]
 
     def at(self, captured: CapturedScene, place: BoundingSphere) -> "EstimatedLight | NoLight":
-        """At a place in the same region: the same sources, and ambient light with what is near there."""
+        """Move the light to a place in the same region: keep the sources, and compute the ambient light there."""
         if place.radius == self.place.radius and torch.equal(place.center, self.place.center):
             return self
         scene = captured.usable.gaussians
@@ -139,9 +135,12 @@ def estimate_light(
     Args:
         captured: The scene without the object.
         place: The object's bounding sphere.
-        object_gaussians: The object itself, if it stands there: its shading and its shadow are evidence, but it is not
-            part of the surroundings.
-        sun_through: Points and their shadows, as for `light.sun.set_sun`: the estimate then has this sun.
+        object_gaussians: The object, if the scene was captured with it. Its shading and its shadow are evidence, but it
+            is not part of the surroundings.
+        sun_through: Points and their shadows, as for `light.sun.set_sun`; they replace the search for a sun.
+
+    Returns:
+        The estimate, or the reason why there is none.
     """
     scene, cameras = captured.usable.gaussians, captured.cameras
     panorama = panorama_at(scene, place)
@@ -159,30 +158,30 @@ def estimate_light(
     )
     hidden = search_radiance(radiance_problem(evidence))
     sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
-    mean = with_source_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
+    mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, place)
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
     return found if sun is None else found.with_sun(sun, scene)
 
 
 def region_around(place: BoundingSphere, cameras: Cameras) -> BoundingSphere:
-    """What is looked at for the light at a place, from about the distance of the cameras."""
+    """Return the region of evidence for the light at a place: the cameras' median distance, within bounds."""
     distance = float((cameras.centers - place.center).norm(dim=1).median())
     return BoundingSphere(place.center, max(_MIN_RADII * place.radius, min(distance, _MAX_RADII * place.radius)))
 
 
 def _seen_shares(evidence: LightEvidence) -> dict[str, float]:
     seen = evidence.around.seen
-    overhead = DIRECTIONS @ evidence.up > _OVERHEAD
+    overhead = DIRECTIONS @ evidence.up > 0.5  # 60 degrees
     return {"coverage": float(seen.mean()), "unseen_up": float(1 - seen[overhead].mean())}
 
 
 def _split_peaks(
     radiance: Float[Tensor, "k 3"], evidence: LightEvidence, *, within: float
 ) -> tuple[tuple[LightSource, ...], Float[Tensor, "k 3"]]:
-    """The brightest of the `DIRECTIONS` above the horizon as sources, brightest first, and the radiance without them.
+    """Split radiance into sources at its peaks above the horizon, brightest first, and the radiance without them.
 
-    What is bright below the horizon is a surface, and stays ambient light. Occluders farther away than `within` do not
+    Peaks below the horizon are bright surfaces and remain ambient light. Occluders farther away than `within` do not
     block sources that no camera saw.
     """
     luminance = radiance @ LUMINANCE
@@ -202,14 +201,14 @@ def _split_peaks(
 
 
 def _ambient_of(rest: Float[Tensor, "k 3"]) -> Float[Tensor, "9 3"]:
-    """Harmonics of degree 2 of radiance from all `DIRECTIONS`."""
+    """Fit spherical harmonics of degree 2 to radiance from all `DIRECTIONS`."""
     return fit_sh(DIRECTIONS, rest, torch.ones(len(DIRECTIONS)))
 
 
 def _source(
     group: Bool[Tensor, "k"], extra: Float[Tensor, "p 3"], evidence: LightEvidence, *, within: float
 ) -> LightSource:
-    """The source of the directions in `group`, whose radiance over the background is `extra`."""
+    """Make one source of the directions in `group`, whose radiance over the background is `extra`."""
     weight = extra @ LUMINANCE
     shares = evidence.visible_sources[group]
     visible = float(shares.sum())
@@ -220,42 +219,42 @@ def _source(
     if visible > 0:
         size = max(visible, 0.1) * SOLID_ANGLE
         distance = _mean_distance(evidence.far.distance[group], weight * shares)
-        name = _SEEN_NAMES[float(direction @ evidence.up) > _LAMP] if distance < _SKY * FARTHEST else "sun"
-        # a small patch may show the sun through a window; a large one stands where the panorama shows it
+        name = _SEEN_NAMES[float(direction @ evidence.up) > _LAMP] if distance < 0.5 * FARTHEST else "sun"
+        # a small patch may show the sun through a window; a large one has the distance of the panorama
         distance = math.inf if size < _SUN else distance
-        radius = angular_radius_deg(size)
-        return LightSource((x, y, z), (r, g, b), radius, _CLIPPED_ERROR_DEG, name=name, distance=distance)
+        # the middle of a clipped patch is about 2 degrees off
+        return LightSource((x, y, z), (r, g, b), angular_radius_deg(size), 2.0, name=name, distance=distance)
     away = torch.rad2deg(torch.acos((towards @ direction).clamp(-1, 1)))
     spread = float((weight * away**2).sum() / weight.sum().clamp_min(1e-9)) ** 0.5
-    error, name = math.hypot(spread, _HALF_BIN_DEG), _UNSEEN_NAMES[float(direction @ evidence.up) > _LAMP]
+    error = math.hypot(spread, 4.0)  # `DIRECTIONS` are resolved to about 4 degrees
+    name = _UNSEEN_NAMES[float(direction @ evidence.up) > _LAMP]
     return LightSource((x, y, z), (r, g, b), _UNSEEN_RADIUS_DEG, error, 1.0, name, blockers_within=within)
 
 
 def _mean_distance(distances: Float[Tensor, "p"], weight: Float[Tensor, "p"]) -> float:
-    """Their weighted harmonic mean."""
+    """Return the weighted harmonic mean."""
     nearness = float((weight / distances).sum() / weight.sum().clamp_min(1e-9))
     return 1 / nearness if nearness > 0 else math.inf
 
 
-def with_source_distances(light: Light, scene: Gaussians, place: BoundingSphere) -> Light:
-    """`light` with `blockers_within` of each source, where it was infinite, from the depth towards it.
+def with_blocker_distances(light: Light, scene: Gaussians, place: BoundingSphere) -> Light:
+    """Set every infinite `blockers_within` of a light's sources from the depth of the scene towards the source.
 
     Args:
-        light: At `place`; its sources are seen from there.
+        light: At `place`; the directions of its sources are as seen from there.
         scene: All Gaussians, without the object.
         place: The object's bounding sphere.
     """
     sources = []
-    focal, width = _SOURCE_IMAGE
     for source in light.sources:
         if math.isfinite(source.blockers_within):
             sources.append(source)
             continue
         direction = torch.tensor(source.direction)
-        # not core.directions.perpendicular: another roll of the camera would change results
+        # core.directions.perpendicular would roll the camera differently and change results
         up = torch.tensor([0.0, 0.0, 1.0]) if abs(source.direction[2]) < 0.9 else torch.tensor([1.0, 0.0, 0.0])
         pose = look_at(place.center[None], place.center + direction, up)
-        rendered = render(scene, pinhole(pose, focal, width=width, height=width), outputs=frozenset({"depth"}))
+        rendered = render(scene, pinhole(pose, 32.0, width=16, height=16), outputs=frozenset({"depth"}))
         visible = rendered.depth > place.radius
         distance = float(rendered.depth[visible].quantile(_SOURCE_QUANTILE)) if bool(visible.any()) else math.inf
         sources.append(replace(source, blockers_within=_BLOCKERS_WITHIN * distance))
@@ -263,10 +262,10 @@ def with_source_distances(light: Light, scene: Gaussians, place: BoundingSphere)
 
 
 def equirectangular_directions(height: int) -> Float[Tensor, "h w 3"]:
-    """Unit directions of an environment map's pixels, twice as wide as high, as Blender's world has them.
+    """Return the unit directions of an environment map's pixels in the layout of Blender's world.
 
-    The top row looks along +z, the middle column along +x, and columns to the right turn towards -y, as seen from
-    inside.
+    The map is twice as wide as high. Its top row looks along +z, its middle column along +x, and columns to the right
+    turn towards -y, seen from inside.
     """
     polar = math.pi * (torch.arange(height) + 0.5)[:, None] / height
     azimuth = 2 * math.pi * (0.5 - (torch.arange(2 * height) + 0.5) / (2 * height))[None]
@@ -276,20 +275,23 @@ def equirectangular_directions(height: int) -> Float[Tensor, "h w 3"]:
 def environment_radiance(
     found: EstimatedLight, captured: CapturedScene, place: BoundingSphere, directions: Float[Tensor, "h w 3"]
 ) -> Float[Tensor, "h w 3"]:
-    """Linear rgb radiance at a place without the sources of the estimate's light, at least 0.
+    """Compute the environment map at a place, without the estimate's sources.
 
     Args:
         found: The estimate at `place`.
         captured: The scene without the object.
-        place: What is nearer than half of its radius is left out.
+        place: The object's bounding sphere; Gaussians nearer to its middle than half its radius are left out.
         directions: Unit, world frame.
+
+    Returns:
+        Linear rgb radiance, at least 0.
     """
     height, width, _ = directions.shape
     flat, face = directions.reshape(-1, 3), max(height, 1)
     cube = render_panorama(captured.usable.gaussians, place.center, size=face, nearest=NEAREST * place.radius)
     shown = cube.radiance.reshape(-1, 3)[cube_pixels(flat, face)]
     around, rest = found.evidence.around, found.rest()
-    # a source that was photographed is cut down to what is around it
+    # photographed sources are limited to the radiance around them
     is_cut = (rest < around.radiance).any(1, keepdim=True)
     limit = torch.where(is_cut, rest, math.inf)[nearest_directions(flat)]
     smooth = _interpolated(torch.cat([around.seen[:, None], _hidden(found, rest)], 1), flat)
@@ -298,10 +300,10 @@ def environment_radiance(
 
 
 def _hidden(found: EstimatedLight, rest: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
-    """What of `rest` no camera recorded.
+    """Return the part of `rest` that no camera recorded.
 
-    A sun that shadows show dims the ambient light, so that the surface is as bright as before. Here that dims only what
-    no camera recorded, by as much as gives the surface the same ambient irradiance, but not below 0.
+    A sun found from shadows dims the ambient light, so that the surface keeps its brightness. Recorded radiance stays,
+    so the hidden part alone is dimmed until the ambient irradiance on the surface agrees, or to 0.
     """
     seen = found.evidence.around.radiance
     hidden = (rest - seen).clamp_min(0)
@@ -313,7 +315,7 @@ def _hidden(found: EstimatedLight, rest: Float[Tensor, "k 3"]) -> Float[Tensor, 
 
 
 def _interpolated(values: Float[Tensor, "k c"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
-    """`values` of all `DIRECTIONS`, smoothly interpolated."""
+    """Interpolate `values` of all `DIRECTIONS` smoothly."""
     parts = []
     for part in directions.split(_CHUNK):
         weights = ((part @ DIRECTIONS.T - 1) / _SMOOTH_RAD**2).exp()

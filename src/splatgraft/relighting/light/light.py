@@ -1,6 +1,4 @@
-"""The value `Light`: the light at a place as a few sources and smooth ambient light; its confidence, and its text form
-light.json.
-"""
+"""The value `Light`: a few sources and smooth ambient light at one place, with its confidence and its text form."""
 
 import json
 import math
@@ -13,30 +11,22 @@ from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
 
-FORMAT = "splatgraft light 1"
-_AMBIENT_DEGREE = 2
-_AMBIENT_COUNT = 9
+_FORMAT = "splatgraft light 1"
+_AMBIENT_DEGREE = 2  # of the spherical harmonics
+_AMBIENT_COUNT = (_AMBIENT_DEGREE + 1) ** 2
 _UNCERTAINTY_BLUR = 0.5
-"""Share of a direction's uncertainty that blurs shadows; measured: least error in rendered scenes. All of it makes
-shadows of a right direction too pale."""
-_UNCERTAIN_DEG = 15.0  # uncertainty of a direction from which on a report says so; set by hand
-_MIN_AMBIENT = 1e-3
-"""Share of the largest ambient coefficient below which ambient irradiance does not fall: expansions may be negative."""
+"""Share of a direction's uncertainty that blurs shadows. Measured: it has the smallest error over rendered scenes; the
+whole uncertainty makes shadows of a correct direction too pale."""
+_MIN_AMBIENT = 1e-3  # lower bound of irradiance over the largest constant coefficient; the expansion may be negative
 
-_MIN_DISTANCE = 1e-4  # world units; minimum distance of a source in a light.json, whose numbers have four decimals
 _SOURCE_NUMBERS = {
     "angular_radius_deg": (0.0, 90.0),
     "uncertainty_deg": (0.0, 90.0),
     "confidence": (0.0, 1.0),
     "blockers_within": (0.0, math.inf),
-    "distance": (_MIN_DISTANCE, math.inf),
+    "distance": (1e-4, math.inf),  # the smallest number above 0 with four decimals, as written
 }
-"""Fields of a source that are one number, and its bounds; a light.json leaves out what is infinite."""
-
-_RIGID = 1e-4  # largest entry of R R^T - I of a rotation in a light.json
-
-_WEAK, _STRONG = 0.25, 0.6
-"""Shares of a source in the light on what faces it, below and above which words say so."""
+"""Scalar fields of a source with their bounds; a light.json leaves out infinite values."""
 
 
 @dataclass(frozen=True)
@@ -46,24 +36,24 @@ class LightSource:
     direction: tuple[float, float, float]
     """Unit vector from the place towards the light, world frame."""
     irradiance: tuple[float, float, float]
-    """Linear rgb on a plane that faces the light, in units in which a white sky of radiance 1 gives pi."""
+    """Linear rgb on a plane that faces the light; a white sky of radiance 1 gives pi."""
     angular_radius_deg: float = 3.0
-    """Half the angle that the light subtends, degrees; the sun's is 0.27."""
+    """Angular radius, degrees; the sun's is 0.27."""
     uncertainty_deg: float = 0.0
     """Standard error of `direction`, degrees; shadows are softened by it."""
     confidence: float = 1.0
-    """Probability that this light exists, in [0, 1]; scales its shadow."""
+    """Probability that the light exists, in [0, 1]; scales its shadow."""
     name: str = "light"
-    """Shown in reports: sun, window, lamp, or what of them it may be."""
+    """Name in reports, such as "sun", "window" or, if either is possible, "sun or window"."""
     blockers_within: float = math.inf
-    """World units; occluders farther away do not block it, such as the window that it comes through."""
+    """Maximum distance of occluders that block the light, world units; a window's pane lies beyond it."""
     distance: float = math.inf
-    """World units from the middle of the lit object, above 0; infinite for the sun. Shadows spread and light falls off
-    from where it stands."""
+    """Distance from the middle of the lit object, world units, above 0; infinite for the sun. A near light's shadows
+    diverge and its irradiance falls off."""
 
     @property
     def softness(self) -> float:
-        """Radius of the cone over which its shadow is blurred, radians: its size and half of its uncertainty."""
+        """Radius of the cone over which the shadow is blurred, radians; it includes half of the uncertainty."""
         return math.hypot(math.radians(self.angular_radius_deg), _UNCERTAINTY_BLUR * math.radians(self.uncertainty_deg))
 
     @property
@@ -78,21 +68,25 @@ class Light:
     """The light at one place, world frame, linear rgb."""
 
     sources: tuple[LightSource, ...]
-    """Brightest first; empty under an even sky."""
+    """Sources, brightest first; empty under an even sky."""
     ambient: Float[Tensor, "9 3"]
-    """Radiance from everything else, spherical harmonics of degree 2."""
+    """Radiance of all other light, coefficients of spherical harmonics of degree 2."""
     coverage: float = 1.0
     """Share of the directions around the place that were captured, in [0, 1]."""
     unseen_up: float = 0.0
     """Share of the directions within 60 degrees of up that were not captured, in [0, 1]."""
 
     def ambient_radiance(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Linear rgb radiance of the ambient light from unit `directions`, at least 0."""
+        """Return the linear rgb radiance of the ambient light from unit `directions`, at least 0."""
         values = spherical_harmonics.basis(directions, _AMBIENT_DEGREE) @ self.ambient.to(directions)
         return values.clamp_min(0)
 
     def irradiance(self, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Linear rgb irradiance on unshadowed planes with unit `normals` (Ramamoorthi and Hanrahan 2001, Eq. 11)."""
+        """Compute the linear rgb irradiance on unshadowed planes (Ramamoorthi and Hanrahan 2001, Eq. 11).
+
+        Args:
+            normals: Unit.
+        """
         bands = torch.tensor([math.pi] + [2 * math.pi / 3] * 3 + [math.pi / 4] * 5).to(normals)
         total = spherical_harmonics.basis(normals, _AMBIENT_DEGREE) @ (bands[:, None] * self.ambient.to(normals))
         total = total.clamp_min(_MIN_AMBIENT * float(self.ambient[0].abs().max()) + 1e-6)
@@ -102,51 +96,31 @@ class Light:
         return total
 
     def rotated(self, rotation: Float[Tensor, "3 3"]) -> "Light":
-        """The same light in a frame that is rotated by `rotation`."""
+        """Return the light with all directions rotated by `rotation`."""
         turned = [(rotation.double() @ torch.tensor(s.direction, dtype=torch.float64)).tolist() for s in self.sources]
         sources = tuple(replace(s, direction=(d[0], d[1], d[2])) for s, d in zip(self.sources, turned, strict=True))
         ambient = spherical_harmonics.rotate(self.ambient[None], rotation)[0]
         return replace(self, sources=sources, ambient=ambient)
 
-    def describe(self, up: Float[Tensor, "3"]) -> str:
-        """One line for a report, such as 'strong light from the sun 62 degrees high (71% of the light on what faces
-        it), a window 20 degrees high (9%; its direction is uncertain); 38% of what is overhead was not photographed'.
-        """
-        named, strongest = [], 0.0
-        for source in self.sources[:3]:
-            direction = torch.tensor(source.direction)
-            height = math.degrees(math.asin(max(-1.0, min(1.0, float(direction @ up)))))
-            share = sum(source.irradiance) / float(self.irradiance(direction[None]).sum())
-            strongest = max(strongest, share)
-            doubt = "; its direction is uncertain" if source.uncertainty_deg > _UNCERTAIN_DEG else ""
-            faces = "" if named else " of the light on what faces it"
-            which = "the" if source.name.startswith("sun") and " or " not in source.name else "a"
-            named.append(f"{which} {source.name} {height:.0f} degrees high ({share:.0%}{faces}{doubt})")
-        lead = "mostly even light, some" if strongest < _WEAK else "light" if strongest < _STRONG else "strong light"
-        parts = [f"{lead} from {', '.join(named)}" if named else "even light without a clear source"]
-        if self.unseen_up > 0.05:
-            parts.append(f"{100 * self.unseen_up:.0f}% of what is overhead was not photographed")
-        return "; ".join([*parts, f"{100 * self.coverage:.0f}% of the surroundings were photographed"])
-
 
 def angular_radius_deg(solid_angle: float) -> float:
-    """Half the angle, in degrees, that a round light of `solid_angle` (steradians) subtends."""
+    """Return the angular radius, degrees, of a round light of `solid_angle` (steradians)."""
     return math.degrees(math.acos(max(-1.0, 1 - solid_angle / (2 * math.pi))))
 
 
 def fit_ambient(radiance: Float[Tensor, "3"]) -> Float[Tensor, "9 3"]:
-    """Coefficients of uniform ambient light of linear rgb `radiance`."""
+    """Return the coefficients of uniform ambient light of linear rgb `radiance`."""
     out = torch.zeros(_AMBIENT_COUNT, 3)
     out[0] = radiance / spherical_harmonics.C0
     return out
 
 
 def light_to_json(light: Light, *, world_from_capture: Float[Tensor, "3 3"] | None = None) -> str:
-    """The text of a light.json, which can be changed by hand and read with `light_from_json`.
+    """Write the text of a light.json, which can be changed by hand and read by `light_from_json`.
 
     Args:
         light: In the axes of a capture.
-        world_from_capture: A rotation into other axes, in which the text has the light, and which it then names.
+        world_from_capture: Rotation into the axes of the text, which then contains it; None keeps the capture's axes.
     """
     axes = {}
     if world_from_capture is not None:
@@ -158,7 +132,7 @@ def light_to_json(light: Light, *, world_from_capture: Float[Tensor, "3 3"] | No
         numbers = {key: round(getattr(source, key), 4) for key in _SOURCE_NUMBERS}
         sources.append(record | {key: value for key, value in numbers.items() if math.isfinite(value)})
     record = {
-        "format": FORMAT,
+        "format": _FORMAT,
         **axes,
         "sources": sources,
         "ambient_sh": [[round(v, 6) for v in row] for row in light.ambient.tolist()],
@@ -172,22 +146,22 @@ def light_from_json(text: str, *, name: str = "light.json") -> Light:
     """Read a light from the text of a light.json.
 
     Args:
-        text: What `light_to_json` gives, perhaps changed by hand.
-        name: The file's name in error messages.
+        text: Text of `light_to_json`, perhaps changed by hand.
+        name: File name in error messages.
 
     Returns:
         The light in the axes of the capture, directions normalised.
 
     Raises:
-        ValueError: The text is no JSON, a key is missing or unknown, or a value is out of its range.
+        ValueError: The text is not JSON, a key is missing or unknown, or a value is out of its range.
     """
     try:
         record = json.loads(text)
     except (json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"{name}: expected JSON, found {error}") from error
-    if not isinstance(record, dict) or record.get("format") != FORMAT:
+    if not isinstance(record, dict) or record.get("format") != _FORMAT:
         found = record.get("format") if isinstance(record, dict) else type(record).__name__
-        raise ValueError(f'{name}: expected "format": "{FORMAT}", found {found!r}')
+        raise ValueError(f'{name}: expected "format": "{_FORMAT}", found {found!r}')
     unknown = sorted(set(record) - {"format", "world_from_capture", "sources", "ambient_sh", "coverage", "unseen_up"})
     if unknown:
         raise ValueError(f"{name}: expected sources, ambient_sh, coverage and unseen_up, found {unknown[0]!r}")
@@ -211,7 +185,8 @@ def _capture_from_world(record: dict[str, Any], name: str) -> Float[Tensor, "3 3
     if not isinstance(given, list) or len(given) != 3:
         raise ValueError(f"{where}: expected 3 rows of a rotation, found {given!r:.60}")
     rotation = torch.tensor([_numbers(row, 3, f"{where}[{i}]", (-1.0, 1.0)) for i, row in enumerate(given)])
-    if not float((rotation @ rotation.T - torch.eye(3)).abs().max()) <= _RIGID or float(torch.linalg.det(rotation)) < 0:
+    is_orthonormal = float((rotation @ rotation.T - torch.eye(3)).abs().max()) <= 1e-4
+    if not is_orthonormal or float(torch.linalg.det(rotation)) < 0:
         raise ValueError(f"{where}: expected a rotation that is orthonormal with determinant 1, found {given!r:.60}")
     return rotation.T
 
@@ -251,20 +226,16 @@ def _numbers(values: object, count: int, where: str, bounds: tuple[float, float]
     return [float(v) for v in values]
 
 
-_C0 = 0.28209479
-"""The harmonics' first band; rounded, and kept so: `core.spherical_harmonics.C0` would change written priors."""
-_UNCERTAIN_DEG = 20.0  # degrees of direction uncertainty at which a source counts exp(-1); set by hand
-
-
 def light_confidence(light: Light) -> float:
-    """Share of the light, in [0, 1], that was captured and whose direction is certain.
+    """Compute the share of the light, in [0, 1], that was captured with a certain direction.
 
-    A source counts by exp(-(uncertainty / 20 degrees)^2) times its confidence, ambient light fully; the sum is scaled
-    by the coverage of the surroundings.
+    A source counts by its confidence times exp(-(uncertainty / 20 degrees)^2); ambient light counts fully. The share is
+    then multiplied by the coverage of the surroundings. The 20 degrees are set by hand.
     """
-    ambient = math.pi * float(light.ambient[0].mean()) * _C0
+    # C0 with 8 digits: more would change the files of priors
+    ambient = math.pi * float(light.ambient[0].mean()) * 0.28209479
     total, certain = ambient, ambient
     for source in light.sources:
         total += source.luminance
-        certain += source.luminance * source.confidence * math.exp(-((source.uncertainty_deg / _UNCERTAIN_DEG) ** 2))
+        certain += source.luminance * source.confidence * math.exp(-((source.uncertainty_deg / 20.0) ** 2))
     return light.coverage * certain / total if total > 0 else 0.0

@@ -1,7 +1,8 @@
-"""What a place sees around it: cube maps of linear radiance rendered from the Gaussians, and their light by direction.
+"""Cube maps of linear radiance around a place, rendered from the Gaussians, and their sum by direction.
 
-`render_panorama` renders from a point, `panorama_at` first tests whether there is light at a place, and
-`surroundings_at` sorts the panorama into `DIRECTIONS`: captured radiance, and what is clipped or unseen.
+- `render_panorama` renders the cube map at a point.
+- `panorama_at` first tests whether there is light at a place.
+- `surroundings_at` sorts the cube map into `DIRECTIONS`: captured radiance, clipped and unseen shares.
 """
 
 import math
@@ -20,14 +21,14 @@ from splatgraft.core.images import linear_from_srgb
 from splatgraft.rendering import RenderOptions, render
 
 DIRECTIONS = even_directions(320)
-"""Unit directions into which all light is sorted: 11 degrees apart, as fine as the surfaces around tell it."""
+"""Unit directions into which all light is sorted, 11 degrees apart; the evidence resolves no finer."""
 SOLID_ANGLE = 4 * math.pi / len(DIRECTIONS)
-"""Steradians of each direction."""
+"""Solid angle of each direction, steradians."""
 FARTHEST = 1e4
-"""World units; what is farther away counts as so far."""
-_TABLE = 64  # pixels; width of a face of the cube map that tells which of the directions is nearest
+"""Upper bound of distances, world units."""
+_TABLE = 64  # pixels; face width of the cube map of nearest directions
 
-# rows right, down and forward of each face: +x, -x, +y, -y, +z, -z
+# each face's right, down and forward axes as rows: +x, -x, +y, -y, +z, -z
 _FACES = torch.tensor(
     [
         [[0.0, -1, 0], [0, 0, -1], [1, 0, 0]],
@@ -39,23 +40,20 @@ _FACES = torch.tensor(
     ]
 )
 # panoramas; set by hand
-_FAINTEST = 0.02  # alpha below which a pixel is empty: its colour is noise
-_WIDEST = 0.2
-"""Standard deviation over distance; wider Gaussians are left out, as splatting's affine approximation smears them."""
+_FAINTEST = 0.02  # alpha below which a pixel counts as empty, because its colour is noise
+_WIDEST = 0.2  # standard deviation over distance; wider ones are left out: the affine approximation smears them
 
-# when there is light at a place; set by hand
+# tests of a place; set by hand
 NEAREST = 0.5
 """Object radii within which Gaussians are left out of the panorama."""
-_TEST_SIZE = 24  # pixels; width of a face of the depth cube map that tests whether the place is inside something
 _BLOCKED_WITHIN = 0.4  # object radii; a nearer surface blocks the view
-_MAX_BLOCKED = 0.6  # share of views; with more blocked the place is inside something
-_MIN_COVERAGE = 0.1  # share of the surroundings that must be captured, in [0, 1]
-_DARKEST = 2e-3  # mean linear radiance; a darker place has no light
+_MAX_BLOCKED = 0.6  # share of blocked directions above which the place is inside something
+_MIN_COVERAGE = 0.1  # minimum captured share of the surroundings, in [0, 1]
+_DARKEST = 2e-3  # mean linear radiance below which a place has no light
 
-# what counts as captured and as clipped in the surroundings
-_SURROUNDINGS_SIZE = 48  # pixels; width of a face of the panorama
-_MIN_ALPHA = 0.3  # alpha below which nothing was captured
-_CLIPPED = 0.955  # sRGB of the brightest channel from which a camera may have clipped; reconstruction loses a little
+# surroundings
+_MIN_ALPHA = 0.3  # alpha below which a direction was not captured
+_CLIPPED = 0.955  # sRGB of the brightest channel above which a photo may be clipped; reconstructed white is darker
 
 
 @dataclass(frozen=True)
@@ -63,28 +61,28 @@ class Panorama:
     """A cube map of s x s pixels per face around one point."""
 
     radiance: Float[Tensor, "6 s s 3"]
-    """Linear rgb, at least 0, from each direction, not premultiplied by alpha."""
+    """Linear rgb radiance, at least 0, not premultiplied by alpha."""
     alpha: Float[Tensor, "6 s s"]
-    """In [0, 1]; 0 where nothing was captured."""
+    """Alpha in [0, 1]; 0 if nothing was captured."""
     directions: Float[Tensor, "6 s s 3"]
-    """Unit, from the point outwards, in the scene's frame."""
+    """Unit directions from the point outwards, scene's frame."""
     solid_angles: Float[Tensor, "6 s s"]
-    """Steradians; they sum to 4 pi."""
+    """Solid angles, steradians; they sum to 4 pi."""
     distance: Float[Tensor, "6 s s"] | None = None
-    """World units from the point to the surfaces; None where it was not asked for."""
+    """Distances from the point to the surfaces, world units; None if not requested."""
 
     @property
     def coverage(self) -> float:
-        """Share of the sphere around the point that the scene covers, in [0, 1]."""
+        """Share of the sphere of directions that the scene covers, in [0, 1]."""
         return float((self.alpha * self.solid_angles).sum() / self.solid_angles.sum())
 
 
 @dataclass(frozen=True)
 class NoLight:
-    """The light at a place could not be estimated."""
+    """Failure to estimate the light at a place."""
 
     reason: str
-    """A sentence for a report."""
+    """Reason as a sentence for a report."""
 
 
 @dataclass(frozen=True)
@@ -96,15 +94,15 @@ class Surroundings:
     seen: Float[Tensor, "k"]
     """Share of each direction that some camera photographed, in [0, 1]."""
     clipped: Float[Tensor, "k"]
-    """Share that is as bright as a camera records, in [0, 1]; the light there may be brighter."""
+    """Share of each direction that is white in the photos, in [0, 1]; its light may be brighter."""
     clipped_direction: Float[Tensor, "k 3"]
-    """Unit, the middle of that part."""
+    """Unit vectors to the middle of the clipped parts."""
     distance: Float[Tensor, "k"]
-    """World units to what was captured there, the harmonic mean; infinite where nothing was."""
+    """Harmonic mean distance of the captured surfaces, world units; infinite if nothing was captured."""
 
 
 def cube_cameras(center: Float[Tensor, "3"], size: int) -> Cameras:
-    """Six cameras of 90 degrees at `center`, `size` pixels wide, that cover all directions once."""
+    """Return six cameras of 90 degrees at `center`, `size` pixels wide, which cover all directions once."""
     poses = torch.eye(4).repeat(6, 1, 1)
     poses[:, :3, :3] = _FACES.transpose(1, 2)
     poses[:, :3, 3] = center
@@ -112,12 +110,12 @@ def cube_cameras(center: Float[Tensor, "3"], size: int) -> Cameras:
 
 
 def cube_directions(size: int) -> tuple[Float[Tensor, "6 s s 3"], Float[Tensor, "6 s s"]]:
-    """Unit directions and solid angles (steradians) of a cube map's pixels, in the order of `cube_cameras`."""
+    """Return unit directions and solid angles (steradians) of a cube map's pixels, in the order of `cube_cameras`."""
     x = (torch.arange(size, dtype=torch.float64) + 0.5) / size * 2 - 1
     v, u = torch.meshgrid(x, x, indexing="ij")
     rays = torch.stack([u, v, torch.ones_like(u)], -1)
     directions = torch.nn.functional.normalize(torch.einsum("hwi,fij->fhwj", rays, _FACES.double()), dim=-1)
-    # exact integral over each pixel: corner antiderivative atan(xy / sqrt(1 + x^2 + y^2))
+    # exact integral over each pixel, with the antiderivative atan(xy / sqrt(1 + x^2 + y^2)) at its corners
     edge = torch.linspace(-1, 1, size + 1, dtype=torch.float64)
     ey, ex = torch.meshgrid(edge, edge, indexing="ij")
     corner = torch.atan2(ex * ey, (1 + ex * ex + ey * ey).sqrt())
@@ -126,7 +124,7 @@ def cube_directions(size: int) -> tuple[Float[Tensor, "6 s s 3"], Float[Tensor, 
 
 
 def cube_pixels(directions: Float[Tensor, "n 3"], size: int) -> Int[Tensor, "n"]:
-    """The pixel of a cube map, in the order of its flattened faces, that each direction falls into."""
+    """Return the cube map pixel of each direction, as a position in the flattened faces."""
     across, down, along = torch.einsum("ni,fji->jnf", directions, _FACES.to(directions)).unbind(0)
     face = along.argmax(1)
     row = torch.arange(len(directions))
@@ -144,11 +142,11 @@ def render_panorama(
         scene: All Gaussians.
         center: World units.
         size: Width of a face, pixels.
-        nearest: World units; Gaussians whose centre is nearer are left out.
-        with_distance: Whether the panorama has the distance of the surfaces, too.
+        nearest: Minimum distance of a Gaussian's centre, world units; nearer ones are left out.
+        with_distance: Whether to return the distances of the surfaces, too.
     """
     away = (scene.means - center.to(scene.means)).norm(dim=-1)
-    # the near plane of each face only removes what is behind it: near Gaussians are already left out
+    # in front of all Gaussians that are left, even in the corners of a face
     near = max(nearest / math.sqrt(3), 1e-6)
     rendered = render(
         scene.select((away >= nearest) & (scene.scales.max(1).values < _WIDEST * away)),
@@ -163,7 +161,7 @@ def render_panorama(
     directions, solid_angles = cube_directions(size)
     distance = None
     if with_distance:
-        # depth runs along each face's axis, which is a direction's largest component
+        # depth is measured along the face's axis, which is the direction's largest component
         depth = torch.where(rendered.depth > 0, rendered.depth, torch.inf)
         distance = depth / directions.abs().max(-1).values.to(alpha)
     return Panorama(
@@ -176,10 +174,18 @@ def render_panorama(
 
 
 def panorama_at(scene: Gaussians, place: BoundingSphere) -> Panorama | NoLight:
-    """The panorama from the middle of an object's bounding sphere; `scene` is without the object."""
+    """Render the panorama from the middle of an object's bounding sphere if there is light.
+
+    Args:
+        scene: All Gaussians, without the object.
+        place: The object's bounding sphere.
+
+    Returns:
+        The panorama, or the reason why there is no light.
+    """
     if scene.count == 0:
         return NoLight("The scene is empty.")
-    rendered = render(scene, cube_cameras(place.center, _TEST_SIZE), outputs=frozenset({"depth"}))
+    rendered = render(scene, cube_cameras(place.center, 24), outputs=frozenset({"depth"}))
     blocked = (rendered.depth > 0) & (rendered.depth < _BLOCKED_WITHIN * place.radius)
     if float(blocked.float().mean()) > _MAX_BLOCKED:
         return NoLight("The object is inside a wall or another thing: there is no light to be found there.")
@@ -193,22 +199,22 @@ def panorama_at(scene: Gaussians, place: BoundingSphere) -> Panorama | NoLight:
 
 
 def place_surroundings(scene: Gaussians, cameras: Cameras, place: BoundingSphere) -> Surroundings:
-    """The surroundings of an object's bounding sphere, with what is near it."""
+    """Compute the surroundings of an object's bounding sphere, near surfaces included."""
     return surroundings_at(scene, cameras, place.center, nearest=NEAREST * place.radius)
 
 
 def surroundings_at(scene: Gaussians, cameras: Cameras, center: Float[Tensor, "3"], *, nearest: float) -> Surroundings:
-    """Sort what a scene shows around a point into directions.
+    """Sort the panorama around a point into `DIRECTIONS`.
 
-    What no camera looked at is not seen, whatever the Gaussians show there.
+    Surfaces outside of all photos count as unseen, even if there are Gaussians.
 
     Args:
         scene: All Gaussians.
-        cameras: Of the scene's capture.
+        cameras: The cameras of the scene's capture.
         center: World units.
-        nearest: World units; Gaussians whose centre is nearer are left out.
+        nearest: Minimum distance of a Gaussian's centre, world units; nearer ones are left out.
     """
-    panorama = render_panorama(scene, center, size=_SURROUNDINGS_SIZE, nearest=nearest, with_distance=True)
+    panorama = render_panorama(scene, center, size=48, nearest=nearest, with_distance=True)
     assert panorama.distance is not None
     directions, angles = panorama.directions.reshape(-1, 3), panorama.solid_angles.flatten()
     points = center + directions * panorama.distance.reshape(-1, 1).clamp(0, FARTHEST)
@@ -232,8 +238,7 @@ def surroundings_at(scene: Gaussians, cameras: Cameras, center: Float[Tensor, "3
 
 
 def nearest_directions(towards: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
-    """Position in `DIRECTIONS` of the one nearest to each unit direction, up to the width of a table's cell, 1.4
-    degrees."""
+    """Return the position in `DIRECTIONS` nearest to each unit direction, by a table with cells of 1.4 degrees."""
     return _nearest_table()[cube_pixels(towards, _TABLE)]
 
 
@@ -247,7 +252,7 @@ def _sum(values: Float[Tensor, "p ..."], index: Int[Tensor, "p"]) -> Float[Tenso
 
 
 def _photographed(points: Float[Tensor, "p 3"], cameras: Cameras) -> Bool[Tensor, "p"]:
-    """Whether a point is within some camera's picture; what is in front of it is not tested."""
+    """Test whether each point lies in some camera's picture; occlusion is ignored."""
     found = torch.zeros(len(points), dtype=torch.bool)
     for camera in cameras:
         pixels, depth = camera.project(points)

@@ -1,14 +1,23 @@
-"""The posterior density of the light around a place, and its local maximum by Gauss-Newton steps.
+"""The posterior density of the light around a place, and its local maxima by Gauss-Newton steps.
 
-Unknown are, in logarithms: the radiance of every direction that no camera saw, what every clipped direction gives
-beyond what the camera recorded, and one albedo per material. For receiver i of material m and transport t_i
+This is MAP estimation in precomputed radiance transfer (Sloan 2002), in gray. The unknowns are logarithms:
+
+- the radiance of every direction that no camera saw,
+- the radiance of every clipped direction beyond the recorded white,
+- one albedo per material.
+
+For receiver i of material m with transport t_i
 
     log colour_i = log albedo_m + log(t_i . radiance + blocked_i * mean colour) + error.
 
-Errors have a Student-t density, weighted so that all receivers together count as few independent ones. Priors: albedo
-log-normal; unseen directions share the level of the seen sky, single ones may be far brighter (Student-t); a clipped
-patch is either a source or a bright surface, and each is log-normal. Highlights add the share of view-dependent change
-that the light explains. All gray; as MAP estimation in precomputed radiance transfer (Sloan 2002).
+Errors have a Student-t density. Neighbours share their errors, so the weights of all receivers sum to a small number of
+independent ones. The priors:
+
+- Albedos are log-normal.
+- Unseen directions share the level of the seen sky, but single ones may be far brighter (Student-t).
+- A clipped patch is either a source or a bright surface, each log-normal.
+
+The likelihood of the highlights is a function of the share of view-dependent change that the light explains.
 """
 
 import math
@@ -21,92 +30,85 @@ from torch import Tensor
 from splatgraft.relighting.light.evidence import HighlightEvidence, ShadingEvidence
 from splatgraft.relighting.light.panorama import DIRECTIONS, Surroundings
 
-_MAX_ALBEDO = math.log(0.9)
-_ABOVE_MAX = 100.0  # precision of the prior that keeps albedo below 0.9
-_LARGEST_STEP = 1.5  # largest change of any logarithm in one step
-_DARKEST = 1e-3  # radiance that the sky is taken to have where nothing at all was seen
-_PRESENT = 0.02  # share of a direction that is clipped, from which it has an unknown
-_UNSEEN = 0.05  # the same for unseen ones
+_MAX_LOG_ALBEDO = math.log(0.9)
+_ABOVE_MAX = 100.0  # precision of the prior that keeps albedos below the maximum
 _TOUCHING = math.cos(math.radians(15))  # clipped directions nearer than this are one patch
-_LOWEST = math.sin(math.radians(-8))
-"""Least sine of the height of what may be a source: a window beside a table reaches below the horizon, reflections lie
-lower."""
+_LOWEST = math.sin(math.radians(-8))  # lowest sine of a source's height; windows reach below the horizon
 _MAX_PATCHES = 5  # clipped patches that may be sources; the search tries all their combinations
-_SMALLEST = 0.05  # directions that such a patch covers at least
 
 
 @dataclass(frozen=True)
 class RadianceSettings:
-    """The numbers of the density, fitted together over training scenes by benchmarks/fit_light.py."""
+    """Parameters of the density, fitted together over training scenes by benchmarks/fit_light.py."""
 
     albedo: float = 0.29
     """Median linear albedo of a material."""
     albedo_sd: float = 0.332
-    """Standard deviation of its logarithm."""
+    """Standard deviation of the log albedo."""
     materials: float = 9.04
-    """Most independent albedos that the materials of a scene are worth."""
+    """Maximum number of independent albedos in a scene."""
     residual: float = 0.816
     """Scale of the error of log colour."""
     nu: float = 4.0
-    """Degrees of freedom of that error; set by hand, as the fit does not tell it from the scale."""
+    """Degrees of freedom of that error; set by hand because the fit cannot separate it from the scale."""
     effective: float = 52.3
-    """Independent receivers that all are worth: neighbours share their errors."""
+    """Number of independent receivers that all receivers count as, because neighbours share their errors."""
     near: float = 1.28
-    """Radii of the surroundings: standard deviation of the weight of surfaces by their distance; the light is that at
-    the object."""
+    """Standard deviation of a receiver's weight over its distance from the object, radii of the region; the light is
+    estimated at the object."""
     highlights: float = 105.0
-    """Independent view-dependent colours that all are worth."""
+    """Number of independent view-dependent colours that all highlights count as."""
     sky_bias: float = -0.07
-    """Mean log radiance of unseen directions over that of the seen ones above the horizon: zeniths are brighter."""
+    """Mean log radiance of unseen directions over that of the seen ones above the horizon."""
     sky_sd: float = 0.431
     """Standard deviation of that difference between scenes."""
     unseen_sd: float = 1.13
-    """Scale of the logarithm of one unseen direction around their common level."""
+    """Scale of one unseen direction's log radiance around the common level."""
     unseen_nu: float = 1.28
-    """Degrees of freedom: the lower, the likelier is a lamp among them."""
+    """Degrees of freedom of that density; lower values make a lamp among the unseen directions likelier."""
     source: float = 77.4
-    """Median radiance of a clipped source, where the camera's white is 1."""
+    """Median radiance of a clipped source; the camera's white is 1."""
     source_sd: float = 0.444
-    """Standard deviation of its logarithm."""
+    """Standard deviation of the source's log radiance."""
     surface: float = 0.121
     """Median radiance of a clipped bright surface beyond white."""
     surface_sd: float = 0.897
-    """Standard deviation of its logarithm."""
+    """Standard deviation of the surface's log radiance."""
     within_patch_sd: float = 0.272
     """Standard deviation of log radiance within a patch."""
     temperature: float = 4.6
-    """By which differences of the log density are divided before its local maxima are averaged."""
+    """Divisor of differences of the log density when its local maxima are averaged."""
 
 
 @dataclass(frozen=True)
 class LightEvidence:
-    """What is known of the light at a place."""
+    """Evidence for the light at a place."""
 
     surfaces: ShadingEvidence
-    """Surfaces of a region around the place."""
+    """Shading of the surfaces in a region around the place."""
     highlights: HighlightEvidence | None
-    """On the same surfaces; None without view-dependent colours."""
+    """Highlights on these surfaces; None without view-dependent colours."""
     far: Surroundings
-    """What surrounds the region."""
+    """Surroundings outside of the region."""
     around: Surroundings
-    """What surrounds the object, near things included."""
+    """Surroundings of the object, near surfaces included."""
     up: Float[Tensor, "3"]
     """Unit, world frame."""
 
     @property
     def visible_sources(self) -> Float[Tensor, "k"]:
-        """Share of each direction that is clipped and lies outside of the region, in [0, 1].
+        """Clipped share of each direction outside of the region, as seen from the object, in [0, 1].
 
-        What is clipped nearby alone is a fault of the reconstruction or a bright surface.
+        Clipped surfaces within the region are errors of the reconstruction or bright surfaces.
         """
         return torch.minimum(self.around.clipped, self.far.clipped)
 
 
 @dataclass(frozen=True)
 class ClippedPrior:
-    """The normal density of the logarithms of the x clipped unknowns, given which patches are sources.
+    """Normal density of the x clipped unknowns, for one choice of the patches that are sources.
 
-    Either is as likely: odds that were fitted to rooms made four white walls of a square its lights.
+    All choices are equally likely: odds fitted to rooms turned four white walls around a square into lights.
     """
 
     mean: Float[Tensor, "x"]
@@ -115,79 +117,79 @@ class ClippedPrior:
 
 @dataclass(frozen=True)
 class RadianceProblem:
-    """One place: m receivers, u unseen and x clipped directions, g materials; double precision."""
+    """Density at one place: m receivers, u unseen and x clipped directions, g materials; double precision."""
 
     evidence: ShadingEvidence
     highlights: HighlightEvidence | None
     around: Surroundings
-    """What surrounds the object, near things included."""
+    """Surroundings of the object, near surfaces included."""
     settings: RadianceSettings
     unseen: Int[Tensor, "u"]
-    """Positions in `DIRECTIONS`."""
+    """Positions of unseen directions in `DIRECTIONS`."""
     clipped: Int[Tensor, "x"]
-    """The same."""
+    """Positions of clipped directions in `DIRECTIONS`."""
     transport: Float[Tensor, "m n"]
-    """n = u + x columns: transport of the unknowns' own shares of their directions."""
+    """Transport of the n = u + x unknowns, each multiplied by its share of its direction."""
     shares: Float[Tensor, "n"]
-    """Those shares, as seen from the surfaces around."""
+    """Unseen or clipped share of each unknown's direction, outside of the region."""
     shares_at_object: Float[Tensor, "n"]
-    """The same as seen from the object."""
+    """Unseen or clipped share of each unknown's direction, seen from the object."""
     may_shine: Bool[Tensor, "n"]
-    """Where a lamp may be: above the horizon. What is bright below it is a surface."""
+    """Whether the direction may contain a lamp: it is above the horizon. Below, bright directions are surfaces."""
     known: Float[Tensor, "m"]
-    """Radiance of white surfaces under what was captured."""
+    """Radiance of white receivers under the captured light."""
     log_color: Float[Tensor, "m"]
     weights: Float[Tensor, "m"]
     """Weights of the receivers; they sum to `effective`."""
     is_white: Bool[Tensor, "m"]
-    """Receivers that the camera clipped: they may be brighter than recorded."""
+    """Whether a receiver is clipped and may be brighter than recorded."""
     material_weights: Float[Tensor, "g"]
-    """How many independent albedos each material is worth."""
+    """Number of independent albedos that each material counts as."""
     sky: float
-    """Log radiance expected of unseen directions."""
+    """Expected log radiance of unseen directions."""
     connected: Bool[Tensor, "x x"]
-    """Which clipped directions are of one patch."""
+    """Whether two clipped directions belong to one patch."""
     patches: tuple[Int[Tensor, "_"], ...]
-    """Positions in `clipped` of connected parts that may be sources: those above the horizon, largest first."""
+    """Positions in `clipped` of the patches that may be sources because they are above the horizon, largest first."""
 
     def split(self, x: Float[Tensor, "s"]) -> tuple[Tensor, Tensor, Tensor]:
-        """The parts of a state: level of the unseen sky, the n log radiances, the g log albedos."""
+        """Split a state into the level of the unseen sky, n log radiances and g log albedos."""
         n = self.transport.shape[1]
         return x[0], x[1 : 1 + n], x[1 + n :]
 
     def received(self, radiances: Float[Tensor, "n"]) -> Float[Tensor, "m"]:
-        """Radiance of white surfaces for log radiances of the unknowns."""
+        """Compute the radiance of white receivers from the log radiances of the unknowns."""
         return (self.known + self.transport @ radiances.exp()).clamp_min(1e-5)
 
     def residual(self, radiances: Float[Tensor, "n"], albedos: Float[Tensor, "g"]) -> Float[Tensor, "m"]:
-        """Logarithm of observed over explained brightness of the receivers, for logarithms of the unknowns."""
+        """Compute the logarithm of observed over explained brightness of the receivers from logarithms."""
         return self.log_color - albedos[self.evidence.material] - self.received(radiances).log()
 
     def counted(self, residual: Float[Tensor, "m ..."]) -> Float[Tensor, "m ..."]:
-        """The residual without that of receivers which may be brighter than the camera recorded."""
+        """Set negative residuals of clipped receivers to 0, because these may be brighter than recorded."""
         is_white = self.is_white.reshape(-1, *[1] * (residual.ndim - 1))
         return torch.where(is_white, residual.clamp_min(0), residual)
 
     def shading_cost(self, residual: Float[Tensor, "m ..."]) -> Float[Tensor, "..."]:
-        """Minus the log likelihood of the receivers' colours."""
+        """Compute the negative log likelihood of the receivers' colours."""
         s, weights = self.settings, self.weights.to(residual).reshape(-1, *[1] * (residual.ndim - 1))
         away = self.counted(residual) ** 2 / (s.nu * s.residual**2)
         return 0.75 * (s.nu + 1) * (weights * torch.log1p(away)).sum(0)
 
     def radiance_at_object(self, x: Float[Tensor, "s"]) -> Float[Tensor, "k"]:
-        """Gray radiance from all `DIRECTIONS` at the object."""
+        """Return the gray radiance from all `DIRECTIONS` at the object."""
         total = self.around.radiance.mean(1).double()
         index = torch.cat([self.unseen, self.clipped])
         return total.index_add(0, index, self.shares_at_object * self.split(x)[1].exp())
 
     def highlight_cost(self, x: Float[Tensor, "s"]) -> float:
-        """Minus the log likelihood of the highlights, up to a constant."""
+        """Compute the negative log likelihood of the highlights, up to a constant."""
         if self.highlights is None:
             return 0.0
         return self.settings.highlights * math.log1p(-self.highlights.explained(self.radiance_at_object(x)))
 
-    def with_prior(self, sources: tuple[bool, ...]) -> ClippedPrior:
-        """The prior where the first patches are sources or not."""
+    def clipped_prior(self, sources: tuple[bool, ...]) -> ClippedPrior:
+        """Return the prior of the clipped unknowns if exactly the patches marked in `sources` are sources."""
         s, count = self.settings, len(self.clipped)
         mean = torch.full((count,), math.log(s.surface), dtype=torch.float64)
         deviation = torch.full((count,), s.surface_sd, dtype=torch.float64)
@@ -206,13 +208,14 @@ def radiance_problem(found: LightEvidence, *, settings: RadianceSettings = Radia
     """Set up the density at one place.
 
     Args:
-        found: What is known.
-        settings: The numbers.
+        found: The evidence at the place.
+        settings: Parameters of the density.
     """
     evidence, far, around, up = found.surfaces, found.far, found.around, found.up
     s = settings
-    unseen = (torch.maximum(1 - far.seen, 1 - around.seen) > _UNSEEN).nonzero()[:, 0]
-    clipped = (far.clipped > _PRESENT).nonzero()[:, 0]
+    # smaller shares get no unknown
+    unseen = (torch.maximum(1 - far.seen, 1 - around.seen) > 0.05).nonzero()[:, 0]
+    clipped = (far.clipped > 0.02).nonzero()[:, 0]
     shares = torch.cat([1 - far.seen[unseen], far.clipped[clipped]]).clamp_min(0).double()
     transport = evidence.transport(far.distance).double()
     blocked = (1 - transport.sum(1)).clamp_min(0)
@@ -224,6 +227,8 @@ def radiance_problem(found: LightEvidence, *, settings: RadianceSettings = Radia
     by_material = torch.zeros(groups, dtype=torch.float64).index_add_(0, evidence.material, weights)
     material_weights = by_material / (by_material + 1)
     material_weights *= min(1.0, s.materials / max(float(material_weights.sum()), 1e-9))
+    # without any seen direction the sky is taken to be almost black
+    sky = max(float(_seen_sky(far, up, mean_color.expand(3)).mean()), 1e-3)
     return RadianceProblem(
         evidence=evidence,
         highlights=found.highlights,
@@ -240,14 +245,14 @@ def radiance_problem(found: LightEvidence, *, settings: RadianceSettings = Radia
         weights=weights,
         is_white=evidence.colors.max(1).values > 0.9,
         material_weights=material_weights,
-        sky=math.log(max(float(_seen_sky(far, up, mean_color.expand(3)).mean()), _DARKEST)) + s.sky_bias,
+        sky=math.log(sky) + s.sky_bias,
         connected=label[:, None] == label[None],
         patches=_patches(far, clipped, label, up)[:_MAX_PATCHES],
     )
 
 
 def _seen_sky(far: Surroundings, up: Float[Tensor, "3"], otherwise: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """Geometric mean radiance of what was seen above the horizon, or of all that was seen, or `otherwise`."""
+    """Return the geometric mean radiance seen above the horizon; else of all seen directions; else `otherwise`."""
     weights = far.seen * (DIRECTIONS @ up > 0)
     if float(weights.sum()) < 2:
         weights = far.seen
@@ -258,7 +263,7 @@ def _seen_sky(far: Surroundings, up: Float[Tensor, "3"], otherwise: Float[Tensor
 
 
 def _patch_labels(clipped: Int[Tensor, "x"], up: Float[Tensor, "3"]) -> Int[Tensor, "x"]:
-    """One label per connected set of directions; a window is not connected with its reflection on a table below it."""
+    """Label connected sets of directions; a window is not connected with its reflection on a table below it."""
     towards = DIRECTIONS[clipped]
     above = towards @ up > _LOWEST
     touching = (towards @ towards.T > _TOUCHING) & (above[:, None] == above)
@@ -278,14 +283,14 @@ def _patches(
     for value in label.unique():
         members = (label == value).nonzero()[:, 0]
         size = float(far.clipped[clipped[members]].sum())
-        # members lie all above or all below
-        if float(DIRECTIONS[clipped[members[0]]] @ up) > _LOWEST and size > _SMALLEST:
+        # all members are on the same side of the horizon; smaller patches are noise
+        if float(DIRECTIONS[clipped[members[0]]] @ up) > _LOWEST and size > 0.05:
             found.append((size, members))
     return tuple(members for _, members in sorted(found, key=lambda patch: -patch[0]))
 
 
 def start(problem: RadianceProblem, prior: ClippedPrior) -> Float[Tensor, "s"]:
-    """The state of an even sky, with albedos between the prior's and those that explain the colours."""
+    """Return the state of an even sky, with albedos between the prior's and those that explain the colours."""
     p, s = problem, problem.settings
     radiances = torch.cat([torch.full((len(p.unseen),), p.sky, dtype=torch.float64), prior.mean])
     residual = p.log_color - p.received(radiances).log()
@@ -298,20 +303,20 @@ def start(problem: RadianceProblem, prior: ClippedPrior) -> Float[Tensor, "s"]:
 
 
 def cost(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"]) -> float:
-    """Minus the log density of shading and priors, up to a constant."""
+    """Compute the negative log density of shading and priors, up to a constant."""
     p, s = problem, problem.settings
     level, radiances, albedo = p.split(x)
     unseen, clipped = radiances[: len(p.unseen)], radiances[len(p.unseen) :]
     total = float(p.shading_cost(p.residual(radiances, albedo)))
     total += 0.5 * float((p.material_weights * ((albedo - math.log(s.albedo)) / s.albedo_sd) ** 2).sum())
-    total += 0.5 * _ABOVE_MAX * float(((albedo - _MAX_ALBEDO).clamp_min(0) ** 2).sum())
+    total += 0.5 * _ABOVE_MAX * float(((albedo - _MAX_LOG_ALBEDO).clamp_min(0) ** 2).sum())
     total += 0.5 * ((float(level) - p.sky) / s.sky_sd) ** 2 + float(unseen_cost(s, unseen - level).sum())
     away = clipped - prior.mean
     return total + 0.5 * float(away @ prior.precision @ away)
 
 
 def unseen_cost(settings: RadianceSettings, away: Tensor) -> Tensor:
-    """Minus the log density of unseen directions' log radiances around their level."""
+    """Compute the negative log density of unseen directions' log radiances around their level."""
     s = settings
     return 0.5 * (s.unseen_nu + 1) * torch.log1p(away**2 / (s.unseen_nu * s.unseen_sd**2))
 
@@ -319,10 +324,10 @@ def unseen_cost(settings: RadianceSettings, away: Tensor) -> Tensor:
 def polish(
     problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], *, steps: int = 8
 ) -> Float[Tensor, "s"]:
-    """The nearest local maximum of the density of shading and priors (Levenberg-Marquardt, reweighted)."""
+    """Find the nearest local maximum of the density of shading and priors (reweighted Levenberg-Marquardt)."""
     best, damping = cost(problem, prior, x), 1e-3
     for _ in range(steps):
-        moved = x + _step(problem, prior, x, damping).clamp(-_LARGEST_STEP, _LARGEST_STEP)
+        moved = x + _step(problem, prior, x, damping).clamp(-1.5, 1.5)
         value = cost(problem, prior, moved)
         if value < best:
             gained, x, best, damping = best - value, moved, value, max(0.3 * damping, 1e-4)
@@ -339,14 +344,14 @@ def _by_material(problem: RadianceProblem, values: Float[Tensor, "m ..."]) -> Fl
 
 
 def _step(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], damping: float) -> Float[Tensor, "s"]:
-    """One damped Gauss-Newton step."""
+    """Compute one damped Gauss-Newton step."""
     p, s = problem, problem.settings
     level, radiances, albedo = p.split(x)
     u, n = len(p.unseen), len(radiances)
     residual = p.counted(p.residual(radiances, albedo))
     weights = 1.5 * p.weights * (s.nu + 1) / (s.nu * s.residual**2 + residual**2)
     weights = torch.where(p.is_white & (residual <= 0), 0.0, weights)
-    slope = (p.transport * radiances.exp()) / p.received(radiances)[:, None]  # of log received by log radiance
+    slope = (p.transport * radiances.exp()) / p.received(radiances)[:, None]  # d log received / d log radiance
     hessian = torch.zeros(len(x), len(x), dtype=torch.float64)
     gradient = torch.zeros(len(x), dtype=torch.float64)
     light, material = slice(1, 1 + n), slice(1 + n, len(x))
@@ -357,10 +362,10 @@ def _step(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], 
     gradient[light] = -(slope.T @ (weights * residual))
     gradient[material] = -_by_material(p, weights * residual)
     diagonal = hessian.diagonal()
-    above = (albedo > _MAX_ALBEDO) * _ABOVE_MAX
+    above = (albedo > _MAX_LOG_ALBEDO) * _ABOVE_MAX
     diagonal[material] += _by_material(p, weights) + p.material_weights * s.albedo_sd**-2 + above + 1e-6
     gradient[material] += p.material_weights * (albedo - math.log(s.albedo)) * s.albedo_sd**-2
-    gradient[material] += above * (albedo - _MAX_ALBEDO)
+    gradient[material] += above * (albedo - _MAX_LOG_ALBEDO)
     away = radiances[:u] - level
     tied = (s.unseen_nu + 1) / (s.unseen_nu * s.unseen_sd**2 + away**2)
     diagonal[1 : 1 + u] += tied
@@ -372,5 +377,5 @@ def _step(problem: RadianceProblem, prior: ClippedPrior, x: Float[Tensor, "s"], 
     gradient[1 + u : 1 + n] += prior.precision @ (radiances[u:] - prior.mean)
     diagonal += damping * diagonal
     factor, failed = torch.linalg.cholesky_ex(hessian)
-    # without a step the caller damps more
+    # after a zero step the caller increases the damping
     return torch.zeros_like(x) if int(failed) else -torch.cholesky_solve(gradient[:, None], factor)[:, 0]

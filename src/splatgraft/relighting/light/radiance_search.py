@@ -1,8 +1,9 @@
-"""The light around a place as an average over the local maxima of its posterior density.
+"""The light around a place as an average over the local maxima of its posterior density (`radiance_model.py`).
 
-First the clipped patches are tried as sources in every combination, then single unseen or clipped directions as
-lamps; the best of each are polished. What several maxima of about the same height say is averaged, and a lamp is
-spread over the directions that explain the scene about as well.
+1. Try the clipped patches as sources in every combination; polish the best.
+2. Try single unseen or clipped directions as additional lamps; polish the best.
+3. Average the maxima, weighted by their density.
+4. Spread each unseen lamp over the directions that explain the scene about equally well.
 """
 
 import itertools
@@ -13,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.relighting.light.panorama import DIRECTIONS
+from splatgraft.relighting.light.panorama import DIRECTIONS, SOLID_ANGLE
 from splatgraft.relighting.light.radiance_model import (
     ClippedPrior,
     LightEvidence,
@@ -24,18 +25,11 @@ from splatgraft.relighting.light.radiance_model import (
     unseen_cost,
 )
 
-_RELEVELED = 0.7  # share of the mean residual that albedos take up before a state is polished
-_WHITE = 0.3  # radiance beyond white that a clipped lamp starts from, at least
-_MIN_SHARE = 0.1  # share of a direction that must be unknown for a lamp in it
-
-# how many local maxima are looked for, and how they are averaged
-_COMBINATIONS = 3  # combinations of clipped patches that are polished
-_LAMPS = 5  # single directions that are tried as lamps
-_MORE_LAMPS = 2  # directions that are tried as one more lamp beside the best maximum
-_STRENGTHS = (4.0, 12.0, 40.0, 120.0)  # radiance of a lamp over what is there without it
-_APART = math.radians(18)  # radians between directions that are tried
-_SAME = 0.04  # root mean square of log irradiance between maxima, below which they are one
-_SPREAD = math.radians(35)  # radians around a lamp over which its direction is uncertain at most
+_RELEVELED = 0.7  # share of the mean residual that albedos absorb before a state is polished
+_MIN_SHARE = 0.1  # minimum unknown share of a direction that may contain a lamp
+_STRENGTHS = (4.0, 12.0, 40.0, 120.0)  # radiance of a lamp over the previous radiance
+_APART = math.radians(18)  # minimum angle between two directions that are tried as lamps
+_SPREAD = math.radians(35)  # maximum angle over which the direction of a lamp is uncertain
 
 
 @dataclass(frozen=True)
@@ -43,31 +37,33 @@ class Maximum:
     """A local maximum of the density."""
 
     cost: float
-    """Minus the log density, highlights included."""
+    """Negative log density, highlights included."""
     state: Float[Tensor, "s"]
     sources: tuple[bool, ...]
-    """Which patches are sources."""
+    """Whether each clipped patch is a source."""
 
 
 @dataclass(frozen=True)
 class RadianceEstimate:
-    """What no camera recorded of the light around a place: means over the posterior, gray, per direction."""
+    """Radiance around a place that no camera recorded: means over the posterior, gray, for each direction."""
 
     unseen: Float[Tensor, "k"]
-    """Radiance of the parts of each direction that no camera saw."""
+    """Radiance of each direction's unseen part."""
     clipped: Float[Tensor, "k"]
-    """Radiance of the clipped parts beyond the camera's white."""
+    """Radiance of each direction's clipped part beyond the camera's white."""
     residual: Float[Tensor, "m"]
-    """Observed over explained brightness of the receivers, logarithm, at the best maximum."""
+    """Logarithm of observed over explained brightness of the receivers at the best maximum."""
 
     def radiance(self, evidence: LightEvidence) -> Float[Tensor, "k 3"]:
-        """Linear rgb radiance from all `DIRECTIONS` at the object; what no camera saw is white, as cameras balance it.
+        """Compute the linear rgb radiance from all `DIRECTIONS` at the object.
+
+        Unseen light is white, because cameras balance their white to it.
 
         Args:
-            evidence: At the object; its near surroundings may be others than those of the estimate.
+            evidence: Evidence at the object, whose near surroundings may differ from those of the estimate.
         """
         around = evidence.around
-        # clipped parts are white, too: their own tint was lost
+        # clipped parts are white, too, because their tint was lost
         white = (1 - around.seen).clamp_min(0) * self.unseen + evidence.visible_sources * self.clipped
         return around.radiance + white[:, None]
 
@@ -78,16 +74,16 @@ def search_radiance(problem: RadianceProblem) -> RadianceEstimate:
     Args:
         problem: The density.
     """
-    nothing = problem.with_prior((False,) * len(problem.patches))
-    dark = polish(problem, nothing, start(problem, nothing), steps=2)
-    combined = _combinations(problem, dark)[:_COMBINATIONS]
+    no_sources = problem.clipped_prior((False,) * len(problem.patches))
+    dark = polish(problem, no_sources, start(problem, no_sources), steps=2)
+    combined = _combinations(problem, dark)[:3]
     found = [_polished(problem, one) for one in combined]
     best = combined[0]
-    # not polished to the end: a state that has learned to do without a lamp hides it
-    early = polish(problem, problem.with_prior(best.sources), best.state, steps=2)
-    found += _with_lamps(problem, replace(best, state=early), _LAMPS)
+    # two steps only: a converged state already explains the effect of a lamp by other light
+    early = polish(problem, problem.clipped_prior(best.sources), best.state, steps=2)
+    found += _with_lamps(problem, replace(best, state=early), 5)
     found.sort(key=lambda maximum: maximum.cost)
-    found += _with_lamps(problem, found[0], _MORE_LAMPS)
+    found += _with_lamps(problem, found[0], 2)
     maxima = _distinct(problem, sorted(found, key=lambda maximum: maximum.cost))
     weights = torch.tensor([(maxima[0].cost - m.cost) / problem.settings.temperature for m in maxima]).double().exp()
     weights /= weights.sum()
@@ -103,35 +99,37 @@ def search_radiance(problem: RadianceProblem) -> RadianceEstimate:
 
 
 def _polished(problem: RadianceProblem, at: Maximum) -> Maximum:
-    prior = problem.with_prior(at.sources)
-    return _at(problem, prior, polish(problem, prior, at.state), at.sources)
+    prior = problem.clipped_prior(at.sources)
+    return _evaluated(problem, prior, polish(problem, prior, at.state), at.sources)
 
 
-def _at(problem: RadianceProblem, prior: ClippedPrior, state: Float[Tensor, "s"], sources: tuple[bool, ...]) -> Maximum:
+def _evaluated(
+    problem: RadianceProblem, prior: ClippedPrior, state: Float[Tensor, "s"], sources: tuple[bool, ...]
+) -> Maximum:
     return Maximum(cost(problem, prior, state) + problem.highlight_cost(state), state, sources)
 
 
 def _combinations(problem: RadianceProblem, dark: Float[Tensor, "s"]) -> list[Maximum]:
-    """All combinations of patches as sources, by cost, albedos shifted together to suit."""
+    """Evaluate all combinations of patches as sources, with albedos shifted together; lowest cost first."""
     n, found = problem.transport.shape[1], []
     for sources in itertools.product((True, False), repeat=len(problem.patches)):
-        prior, state = problem.with_prior(sources), dark.clone()
+        prior, state = problem.clipped_prior(sources), dark.clone()
         state[1 + len(problem.unseen) : 1 + n] = prior.mean
         _, radiances, albedo = problem.split(state)
         residual = problem.residual(radiances, albedo)
         state[1 + n :] += _RELEVELED * float((problem.weights * residual).sum() / problem.weights.sum().clamp_min(1e-9))
-        found.append(_at(problem, prior, state, sources))
+        found.append(_evaluated(problem, prior, state, sources))
     return sorted(found, key=lambda maximum: maximum.cost)
 
 
 def _lamp_costs(
     problem: RadianceProblem, prior: ClippedPrior, state: Float[Tensor, "s"], strengths: tuple[float, ...]
 ) -> Float[Tensor, "3 n f"]:
-    """Each unknown made a lamp of each strength: change of the cost up to a constant, log radiance, albedos' shift."""
+    """Make each unknown a lamp of each strength: return cost up to a constant, log radiance and shift of albedos."""
     p, s = problem, problem.settings
     level, radiances, albedo = p.split(state)
     u, now = len(p.unseen), radiances.exp()
-    at_least = torch.where(torch.arange(len(now)) < u, level.exp(), _WHITE)
+    at_least = torch.where(torch.arange(len(now)) < u, level.exp(), 0.3)  # 0.3 beyond white for a clipped lamp
     residual = p.residual(radiances, albedo).float()
     relative = (p.transport / p.received(radiances)[:, None]).float()
     index = torch.cat([p.unseen, p.clipped])
@@ -157,8 +155,8 @@ def _lamp_costs(
 
 
 def _with_lamps(problem: RadianceProblem, base: Maximum, count: int) -> list[Maximum]:
-    """The polished states with one more lamp, at the `count` best directions."""
-    prior = problem.with_prior(base.sources)
+    """Add one lamp in each of the `count` best directions, and polish each state."""
+    prior = problem.clipped_prior(base.sources)
     costs, radiances, shifts = _lamp_costs(problem, prior, base.state, _STRENGTHS)
     left, strength = costs.min(1)
     towards = DIRECTIONS[torch.cat([problem.unseen, problem.clipped])]
@@ -176,31 +174,31 @@ def _with_lamps(problem: RadianceProblem, base: Maximum, count: int) -> list[Max
 
 
 def _distinct(problem: RadianceProblem, maxima: list[Maximum]) -> list[Maximum]:
-    """The maxima of which no better one gives the same irradiance."""
+    """Remove maxima whose irradiance a better one gives, too, to 0.04 in the RMS of its logarithm."""
     kept: list[Maximum] = []
     seen: list[Tensor] = []
     for maximum in maxima:
         log_irradiance = irradiance_of(problem.radiance_at_object(maximum.state)).clamp_min(1e-6).log()
-        if all(float((log_irradiance - other).pow(2).mean().sqrt()) > _SAME for other in seen):
+        if all(float((log_irradiance - other).pow(2).mean().sqrt()) > 0.04 for other in seen):
             kept.append(maximum)
             seen.append(log_irradiance)
     return kept
 
 
 def irradiance_of(radiance: Float[Tensor, "k ..."], normals: Float[Tensor, "n 3"] = DIRECTIONS) -> Tensor:
-    """Irradiance on unshadowed planes with unit `normals` from the radiance of all `DIRECTIONS`."""
+    """Compute the irradiance on unshadowed planes with unit `normals` from the radiance of all `DIRECTIONS`."""
     cosine = (normals @ DIRECTIONS.T).clamp_min(0).to(radiance)
-    return cosine @ radiance * (4 * math.pi / len(DIRECTIONS))
+    return cosine @ radiance * SOLID_ANGLE
 
 
 def _hidden_radiance(problem: RadianceProblem, maximum: Maximum) -> Float[Tensor, "2 k"]:
-    """Radiance of unseen and clipped parts; unseen lamps are spread over directions that explain the scene as well."""
+    """Return the radiance of unseen and clipped parts, with unseen lamps spread over equally likely directions."""
     level, radiances, _ = problem.split(maximum.state)
     count = len(problem.unseen)
     out = torch.zeros(2, len(DIRECTIONS), dtype=torch.float64)
     out[0, problem.unseen], out[1, problem.clipped] = radiances[:count].exp(), radiances[count:].exp()
     towards, shares = DIRECTIONS[problem.unseen], problem.shares[:count].clamp_min(_MIN_SHARE)
-    prior = problem.with_prior(maximum.sources)
+    prior = problem.clipped_prior(maximum.sources)
     is_lamp = (radiances[:count] - level > math.log(_STRENGTHS[0])) & problem.may_shine[:count]
     for i in is_lamp.nonzero()[:, 0].tolist():
         without = maximum.state.clone()

@@ -1,6 +1,7 @@
-"""Samples of a `Light`: every source is cut into directional samples, the ambient light into 32 even ones.
+"""Samples of a `Light`: directional lights with one shadow map each.
 
-Area lights and environment light as sets of directional lights, each of which one shadow map follows.
+A source becomes one sample, or several over its cone if it is wide. The ambient light becomes 32 samples spread evenly
+over the sphere.
 """
 
 import math
@@ -13,29 +14,28 @@ from torch import Tensor
 from splatgraft.core.directions import even_pairs, vogel_offsets
 from splatgraft.relighting.light.light import Light, LightSource
 
-# how finely a light is sampled
 _AMBIENT_SAMPLES = 32  # directions over the sphere, an even number; set by hand
-_SOURCE_SAMPLES = 9  # most samples of all sources together; set by hand
+_SOURCE_SAMPLES = 9  # maximum number of samples of all sources together; set by hand
 _SINGLE_SOFTNESS = math.radians(8.0)
-"""Radians; a source up to this softness is one sample. Measured: one filtered map is then within 0.02 of rays."""
+"""Maximum softness of a source that is one sample. Measured: one filtered map is then within 0.02 of traced rays."""
 
 
 @dataclass(frozen=True)
 class LightSamples:
-    """k samples that together are the light at a place; those of the sources come first."""
+    """k samples whose sum is the light at a place; samples of sources come first."""
 
     directions: Float[Tensor, "k 3"]
-    """Unit, towards the light."""
+    """Unit vectors towards the light."""
     irradiance: Float[Tensor, "k 3"]
-    """Linear rgb on a plane that faces the sample's direction."""
+    """Linear rgb irradiance on a plane that faces the sample."""
     softness: Float[Tensor, "k"]
-    """Radius of the cone of directions that the sample stands for, radians."""
+    """Radius of the sample's cone of directions, radians."""
     is_source: tuple[bool, ...]
-    """True for a sample of a source, False for one of the ambient light."""
+    """Whether a sample belongs to a source, not to the ambient light."""
     blockers_within: tuple[float, ...]
-    """World units; occluders farther away towards the light do not block the sample."""
+    """Maximum distance of occluders that block the sample, world units."""
     distances: Float[Tensor, "k"]
-    """World units from the middle of the place; infinite for directional samples."""
+    """Distances from the middle of the place, world units; infinite for directional samples."""
 
     def __len__(self) -> int:
         """Number of samples k."""
@@ -48,7 +48,7 @@ class LightSamples:
 
     @property
     def of_ambient(self) -> "LightSamples":
-        """The ambient samples: the second half are the opposites of the first."""
+        """The ambient samples; the directions of the second half are opposite to those of the first."""
         return self._part(slice(sum(self.is_source), None))
 
     def _part(self, rows: slice) -> "LightSamples":
@@ -56,10 +56,10 @@ class LightSamples:
 
 
 def sample_light(light: Light) -> LightSamples:
-    """All samples of `light`: those of its sources first, brightest source first, then the ambient ones.
+    """Sample a light: first its sources, brightest first, then its ambient light.
 
-    A source of confidence c gives c of its irradiance to its own samples and the rest to the ambient ones, so a source
-    that may not exist casts a weaker shadow.
+    A source of confidence c gives the share c of its irradiance to its own samples and the rest to the ambient ones.
+    Thus a source that may not exist casts a weaker shadow.
     """
     directions, irradiance, softness, within, distances = [], [], [], [], []
     for source, count in zip(light.sources, _sample_counts(light), strict=False):
@@ -87,12 +87,15 @@ def sample_light(light: Light) -> LightSamples:
 
 
 def main_source_samples(light: Light) -> int:
-    """How many of the first samples of `light` belong to its first source."""
+    """Return the number of samples of the first source of `light`, which come first."""
     return _sample_counts(light)[0] if light.sources else 0
 
 
 def _sample_counts(light: Light) -> list[int]:
-    """Samples per source, brightest first: a wide one takes all that are free, or half where later ones are wide."""
+    """Divide the samples among sources, brightest first.
+
+    Every source gets one. A wide source takes all free samples, or half of them if a later source is wide, too.
+    """
     wide = [source.softness > _SINGLE_SOFTNESS for source in light.sources[:_SOURCE_SAMPLES]]
     free = _SOURCE_SAMPLES - len(wide)
     counts = []
@@ -104,12 +107,12 @@ def _sample_counts(light: Light) -> list[int]:
 
 
 def _cone_directions(source: LightSource, count: int) -> list[torch.Tensor]:
-    """Directions over the cone of `source` (Vogel spiral), inside its rim by as much as a sample's own cone is wide."""
+    """Spread directions over the cone of `source` (Vogel spiral), so that the samples' own cones end at its rim."""
     direction = torch.tensor(source.direction)
     if count == 1:
         return [direction]
     j = torch.arange(count)
-    # variances add: of the spiral, radius R sqrt(1 - 1/count), and of a sample, radius R / sqrt(count)
+    # the variances of the spiral, radius R sqrt(1 - 1/count), and of a sample, radius R / sqrt(count), sum to R^2's
     r = ((j + 0.5) / count * (1 - 1 / count)).sqrt() * math.sin(source.softness)
     offsets = vogel_offsets(direction, r, j)
     offsets = offsets - offsets.mean(0)

@@ -1,13 +1,16 @@
-"""The sun from the shadows that a scene shows on the level surface around a place: its direction and its strength.
+"""Direction and strength of the sun from the shadows that a scene shows on the level surface around a place.
 
-It is found by itself (`find_sun`), or goes through points that someone names with their shadows (`set_sun`).
+`find_sun` searches for the sun:
 
-The surface is drawn as a picture from above: the median over the cameras of what they show of it. In sunlight the
-picture is darker wherever something that stands on the surface blocks the sun, and a little at the foot of what stands
-there, which blocks the other light. For every direction the shadow of all that stands there is drawn the same way, and
-the differences of log luminance between texels a few apart are compared with those that sun and other light predict.
-Texels differ by their material, too (Cauchy density), and may be shaded by what no camera saw, one by one or a whole
-tile of the picture.
+1. Draw the surface as a picture from above, the median over the cameras.
+2. Draw the shadow that the Gaussians above the surface cast for each of 1,600 sun directions, and the ambient occlusion
+   at their feet.
+3. Compare differences of log luminance between texels a few texels apart in the picture with the differences that sun
+   and other light predict. The density of a difference is a Cauchy density, because texels also differ by material. It
+   is mixed with the chance that something unseen shades a texel, or a whole tile of the picture.
+4. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
+
+`set_sun` takes the direction from points that a user marks together with their shadows.
 """
 
 import math
@@ -31,55 +34,42 @@ from splatgraft.relighting.shadows.shadow_maps import Occluders, Window, occlude
 from splatgraft.rendering import Render
 
 # the picture of the surface; set by hand
-_SIZE = 192  # texels, a multiple of 16: width of the picture and of the shadow maps
-_MAX_POINTS = 6000  # points among which the plane is looked for
-_PLANE = LevelPlaneOptions(inlier_share=0.2, thickness=0.035)  # what counts as a surface around the place
-_SOLID = 0.9  # alpha from which a pixel shows a surface
-_FLATTEST = 0.12  # cosine between a ray and the normal below which a view is too flat to count
-_MIN_VIEWS = 2  # views that must show a texel
-_MIN_TEXELS = 1500  # with fewer there is no evidence
-_WHITE, _BLACK = 0.93, 0.01
-"""Linear; texels with a brighter channel may be clipped, darker ones are noise."""
+_SIZE = 192  # texels, a multiple of 16; width of the picture and of the shadow maps
+_PLANE = LevelPlaneOptions(inlier_share=0.2, thickness=0.035)
+_MIN_TEXELS = 1500  # with fewer usable texels there is no evidence
+_WHITE, _BLACK = 0.93, 0.01  # linear; brighter channels may be clipped, darker luminances are noise
 
 # differences between texels; set by hand
-_COARSE, _FINE, _ACROSS = 6, 3, 14
-"""Texels between those that are compared: in the search, in its refinement, and for the ratio of lit to shaded."""
+_COARSE, _FINE, _ACROSS = 6, 3, 14  # texels between compared texels: search, refinement, ratio of lit to shaded
 _MAX_GREEN, _MAX_RED = 0.15, 1.2
-"""Largest difference of log(green / sqrt(red blue)) and of log(red / blue); sun and sky differ along the latter."""
+"""Largest differences of log(green / sqrt(red blue)) and of log(red / blue) within one material. The second is larger
+because sun and sky differ along it."""
 _NOISE = 0.12  # scale of differences of log luminance within a material
-_SHADED_TEXEL, _SHADED_TILE = 0.15, 0.5
-"""Probability that something unseen shades a texel, and a whole tile."""
-_EDGE = 0.9  # least difference of visibility between texels on both sides of a shadow's edge
+_SHADED_TEXEL, _SHADED_TILE = 0.15, 0.5  # probabilities that something unseen shades a texel, and a whole tile
 _TILES = 8  # tiles along a side of the picture
 
 # the search
 _DIRECTIONS = even_directions(1600)  # 5 degrees apart
-_AMBIENT_DIRECTIONS = even_directions(200)  # from which all other light comes, on both sides of the surface
-_DARKEST = 0.02  # least share of that light at a texel, since some of it is reflected by what blocks the rest
-_STANDING_WITHIN = 1.4  # radii of the region within which things cast shadows
-_LOWEST = math.sin(math.radians(2.0))  # least sine of the sun's height over the surface
-_AT_ONCE = 64  # directions at a time; bounds memory
+_AMBIENT_DIRECTIONS = even_directions(200)  # directions of all other light, on both sides of the surface
+_DARKEST = 0.02  # lower bound of that light's visibility at a texel, because occluders reflect some of it
+_STANDING_WITHIN = 1.4  # radii of the region within which Gaussians cast shadows
+_LOWEST = math.sin(math.radians(2.0))  # sine of the sun's minimum height over the surface
 _STRENGTHS = (1.0, 3.0, 9.0)  # irradiance of the sun over that of all other light on the surface, in the search
 _FINE_STRENGTHS = (0.5, 1.0, 1.8, 3.0, 5.0, 10.0)
-_MODES = 4  # local maxima that are refined
-_APART = math.cos(math.radians(8.0))  # cosine of the smallest angle between two
+_APART = math.cos(math.radians(8.0))  # cosine of the minimum angle between two maxima
 _SPANS = ((3.0, 1.0), (1.0, 0.33))  # half width and step of the grids around a maximum, degrees
-_PROMISING = 10.0  # log likelihood over that of even light from which a direction of the search is refined
-_DECISIVE = 40.0
-"""Log likelihood over that of all other light from which there is a sun; chosen with benchmarks/fit_sun.py."""
-_MIN_RATIO = 0.3  # least irradiance of a sun over that of all other light, with less it is none
-_MIN_RATIO_BY_HAND = 0.6  # the same of a sun set by hand where no edge of a shadow shows its strength
-_RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12
-"""Angular radii that are tried, and the directions that stand for each."""
-_BLURS = 5  # widths of the reconstruction's blur that are tried beside each radius
-_UNSEEN_RADIUS_DEG = 1.0  # angular radius of a sun set by hand where no edge of a shadow shows it
-_SOFTER = 3.0  # log likelihood over that of a smaller radius from which a larger one is taken: 20 to 1
-_ERROR_DEG = 1.0  # standard error of a direction that was found, and the least of one that was set by hand
-_AROUND_SHADOW = 2.5
-"""Distances from a point to its shadow: radius of the region in which the strength of a sun set by hand is measured."""
+_PROMISING = 10.0  # log likelihood over that of even light above which a direction of the search is refined
+_DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
+_MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
+_MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
+_RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12  # angular radii that are tried, and directions that sample each
+_UNSEEN_RADIUS_DEG = 1.0  # angular radius of a sun set by hand if no edge of a shadow shows it
+_SOFTER = 3.0  # log likelihood over a smaller radius above which a larger one is taken, 20 to 1
+_ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for one set by hand
+_AROUND_SHADOW = 2.5  # region in which a sun set by hand is measured, in distances from a point to its shadow
 
 SET_BY_HAND = "sun set by hand"
-"""Name of such a sun in reports."""
+"""Name in reports of a sun from `set_sun`."""
 
 Point = tuple[float, float, float]
 """World units."""
@@ -87,24 +77,24 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Sun:
-    """A sun, as shadows on a surface show it."""
+    """A sun found from shadows on a surface."""
 
     direction: Float[Tensor, "3"]
-    """Unit, towards the sun, world frame."""
+    """Unit vector towards the sun, world frame."""
     radius_deg: float
-    """Angular radius; a window's is larger than the sun's."""
+    """Angular radius, degrees; a window's is larger than the sun's."""
     normal: Float[Tensor, "3"]
-    """Unit, of the surface."""
+    """Unit normal of the surface, upwards."""
     ratio: Float[Tensor, "3"] | None
-    """Irradiance of the sun over that of all other light on the surface, per channel; None where none was measured."""
+    """Irradiance of the sun over that of all other light on the surface, for each channel; None if not measured."""
     evidence: float
-    """Log likelihood over that of all other light alone; infinite where it was set by hand."""
+    """Log likelihood over that of all other light alone; infinite if set by hand."""
     error_deg: float = _ERROR_DEG
-    """Standard error of the direction."""
+    """Standard error of the direction, degrees."""
     name: str = ""
-    """Where it was set by hand, as in `LightSource`."""
+    """Name in reports, as in `LightSource`; empty for a sun that was found."""
     blockers_within: float = math.inf
-    """World units; occluders farther away do not block it."""
+    """Maximum distance of occluders that block the sun, world units."""
 
 
 @dataclass(frozen=True)
@@ -112,21 +102,27 @@ class Surface:
     """A square of a level plane, divided into s x s texels."""
 
     plane: LevelPlane
-    """With its normal upwards."""
+    """Plane, with an upward normal."""
     center: Float[Tensor, "3"]
-    """On the plane, world units."""
+    """Middle of the square, on the plane, world units."""
     half: float
     """Half the width of the square, world units."""
 
     def texels(self, every: int = 1) -> Float[Tensor, "s s 3"]:
-        """The middles of every so many texels, world units."""
+        """Return the middles of the texels in every `every`-th row and column, world units."""
         right, down = tangents(self.plane.normal)
         x = ((torch.arange(0, _SIZE, every) + 0.5) / _SIZE * 2 - 1) * self.half
         v, u = torch.meshgrid(x, x, indexing="ij")
         return self.center + u[..., None] * right + v[..., None] * down
 
     def shadows(self, occluders: Occluders, directions: Float[Tensor, "k 3"], every: int = 1) -> Float[Tensor, "k s s"]:
-        """Share of the light from each of some directions that reaches texels past occluders above the plane."""
+        """Compute the share of light from each of k directions that reaches texels past occluders above the plane.
+
+        Args:
+            occluders: Gaussians that block light.
+            directions: Unit, towards the light.
+            every: Stride of the texels.
+        """
         radius = 1.05 * self.half
         window = Window(center=self.center, radius=radius, frames=frames_along(directions))
         alpha = splat_depth_maps(occluders, window, size=_SIZE, with_color=False).alpha
@@ -134,7 +130,7 @@ class Surface:
         return 1 - F.grid_sample(alpha[:, None], at, align_corners=False)[:, 0]
 
     def ambient(self, occluders: Occluders) -> Float[Tensor, "s s"]:
-        """Share of an even sky's irradiance that reaches the texels past occluders above the plane."""
+        """Compute the share of an even sky's irradiance that reaches the texels past occluders above the plane."""
         cosines = _AMBIENT_DIRECTIONS @ self.plane.normal
         above = cosines > _LOWEST
         visible = self.shadows(occluders, _AMBIENT_DIRECTIONS[above])
@@ -143,24 +139,25 @@ class Surface:
 
 @dataclass(frozen=True)
 class SurfacePicture:
-    """What the views of a capture show of a surface."""
+    """A surface as the views of a capture show it."""
 
     surface: Surface
-    """Of s x s texels."""
+    """Surface of s x s texels."""
     log_rgb: Float[Tensor, "s s 3"]
-    """Logarithm of linear rgb, the median over the views."""
+    """Logarithm of linear rgb, median over the views."""
     valid: Bool[Tensor, "s s"]
-    """Where enough views show the surface, neither clipped nor black."""
+    """Whether enough views show the texel, neither clipped nor black."""
 
 
 def find_surface(captured: CapturedScene, region: BoundingSphere) -> Surface | None:
-    """The level surface that most of a region shows to the cameras; None where there is none."""
+    """Find the dominant level surface that the cameras see in a region, if there is one."""
     seen = []
     for camera, drawn in captured.views:
         points = camera.unproject(drawn.depth[0])
-        seen.append(points[(drawn.alpha[0] > _SOLID) & ((points - region.center).norm(dim=-1) < region.radius)])
+        is_solid = drawn.alpha[0] > 0.9
+        seen.append(points[is_solid & ((points - region.center).norm(dim=-1) < region.radius)])
     points = torch.cat(seen)
-    points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:_MAX_POINTS]]
+    points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:6000]]
     plane = dominant_level_plane(points, captured.up, options=_PLANE)
     if plane is None:
         return None
@@ -171,23 +168,23 @@ def find_surface(captured: CapturedScene, region: BoundingSphere) -> Surface | N
 
 
 def draw_surface(captured: CapturedScene, surface: Surface) -> SurfacePicture:
-    """Draw a surface as the cameras of a capture show it."""
+    """Draw a surface as the median of the views of a capture."""
     colors = torch.stack([_seen_texels(surface, camera, drawn) for camera, drawn in captured.views])
-    enough = (~colors[..., 0].isnan()).sum(0) >= _MIN_VIEWS
+    enough = (~colors[..., 0].isnan()).sum(0) >= 2  # views
     log_rgb = colors.nanmedian(0).values.nan_to_num()
     linear = log_rgb.exp()
     return SurfacePicture(surface, log_rgb, enough & (linear.amax(-1) < _WHITE) & (linear @ LUMINANCE > _BLACK))
 
 
 def standing_on(surface: Surface, scene: Gaussians, region: BoundingSphere) -> Occluders:
-    """What stands on a surface or hangs above it, in a region or a little outside."""
+    """Select the Gaussians above a surface, in a region or a little outside, as occluders."""
     near = (scene.means - region.center).norm(dim=1) < _STANDING_WITHIN * region.radius
     above = scene.select(near & (surface.plane.height(scene.means) > surface.plane.thickness))
     return occluders_of(thinned(above, width=2 * surface.half / _SIZE))
 
 
 def _seen_texels(surface: Surface, camera: Cameras, drawn: Render) -> Float[Tensor, "s s 3"]:
-    """Logarithm of the linear rgb that one view shows of the texels; nan where it does not show the surface there."""
+    """Return the logarithm of linear rgb of the texels in one view; nan if it does not show the surface there."""
     texels = surface.texels()
     pixels, depth = camera.project(texels)
     away, at = depth.clamp_min(1e-6), pixels / camera.sizes[0].to(texels) * 2 - 1
@@ -197,10 +194,10 @@ def _seen_texels(surface: Surface, camera: Cameras, drawn: Render) -> Float[Tens
     rays = texels - camera.centers[0]
     distance = rays.norm(dim=-1)
     steepness = -(rays @ surface.plane.normal) / distance
-    # height over the plane of what the view shows along the ray to a texel
+    # height over the plane of the point that the view shows along the ray to a texel
     height = (1 - sampled[3] / away) * distance * steepness
     shown = (depth > 0) & (at.abs().amax(-1) < 1) & (height.abs() < surface.plane.thickness)
-    shown &= steepness > _FLATTEST
+    shown &= steepness > 0.12  # flatter views are too inaccurate
     return torch.where(shown[..., None], sampled[:3].permute(1, 2, 0).clamp_min(1e-3).log(), math.nan)
 
 
@@ -210,20 +207,20 @@ class _Differences:
 
     first: Int[Tensor, "p"]
     second: Int[Tensor, "p"]
-    """Position of each of the two texels, row by row."""
+    """Positions of the two texels, row by row."""
     luminance: Float[Tensor, "p"]
-    """Difference of the logarithms of luminance, second less first, in units of `_NOISE`."""
+    """Log luminance of the second texel minus that of the first, in units of `_NOISE`."""
     tile: Int[Tensor, "p"]
     """Tile of each pair."""
 
     def of(self, values: Float[Tensor, "k s s"]) -> Float[Tensor, "k p"]:
-        """Differences of other values."""
+        """Compute the differences of other values between the same texels."""
         flat = values.flatten(1)
         return flat.index_select(1, self.second) - flat.index_select(1, self.first)
 
     def log_likelihoods(self, brightness: Float[Tensor, "k s s"]) -> Float[Tensor, "k p"]:
-        """Log likelihood of each pair under k logarithms of light, over that of even light."""
-        # ratio of two Cauchy densities, mixed with 1
+        """Compute the log likelihood of each pair under k log irradiances, over that of even light."""
+        # a ratio of two Cauchy densities, mixed with 1
         share = (1 - _SHADED_TEXEL) * (1 + self.luminance.square())
         off = self.of(brightness).div_(-_NOISE).add_(self.luminance)
         return (share / off.square_().add_(1)).add_(_SHADED_TEXEL).log_()
@@ -231,18 +228,26 @@ class _Differences:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """The differences of a picture between texels that are `apart`, along both axes."""
+    """Differences of a picture between texels at a fixed distance along both axes."""
 
     apart: int
+    """Distance between the two texels of a pair, texels."""
     step: int
-    """Texels between one pair and the next; about `apart` squared pairs tell the same."""
+    """Distance between one pair and the next, texels. Pairs depend on each other, so each counts (step / apart)^2."""
     every: int
-    """All of these texels are at multiples of it: what is compared has every so many alone."""
+    """Stride at which texels are compared: only every `every`-th row and column is used."""
     axes: tuple[_Differences, _Differences]
+    """Horizontal and vertical differences."""
 
     @staticmethod
     def of(picture: SurfacePicture, apart: int, step: int | None = None) -> "_Comparison":
-        """Compare what may be of one material in sun and shade, at every `step`; None: half of `apart`."""
+        """Compare texels that may be one material in sun and shade.
+
+        Args:
+            picture: The surface.
+            apart: Distance between the two texels of a pair, texels.
+            step: Distance between pairs, texels; None: half of `apart`, at least 2.
+        """
         step = step or max(2, apart // 2)
         every = step if apart % step == 0 else 1
         log_rgb, valid = picture.log_rgb[::every, ::every], picture.valid[::every, ::every]
@@ -264,7 +269,7 @@ class _Comparison:
         return _Comparison(apart, step, every, (along((whole, low), (whole, high)), along((low, whole), (high, whole))))
 
     def log_likelihoods(self, irradiance: Float[Tensor, "k s s"]) -> Float[Tensor, "k"]:
-        """Log likelihood of k patterns of light on the surface, in any unit, over that of even light."""
+        """Compute the log likelihood of k patterns of irradiance on the surface over that of even light."""
         brightness, by_tile = irradiance.log(), torch.zeros(len(irradiance), _TILES**2)
         for one in self.axes:
             by_tile.index_add_(1, one.tile, one.log_likelihoods(brightness))
@@ -274,23 +279,26 @@ class _Comparison:
     def of_suns(
         self, visible: Float[Tensor, "k s s"], ambient: Float[Tensor, "s s"], strengths: tuple[float, ...]
     ) -> Float[Tensor, "k"]:
-        """The same of k suns, each at its best strength.
+        """Compute the log likelihood of k suns over that of even light, each at its best strength.
 
         Args:
             visible: Share of each sun's light that reaches the texels.
             ambient: Share of all other light that reaches them.
-            strengths: Irradiance of the sun over that of all other light on the surface, where nothing blocks them.
+            strengths: Irradiance of the unblocked sun over that of all other unblocked light on the surface.
         """
         return torch.stack([self.log_likelihoods(ambient + s * visible) for s in strengths]).amax(0)
 
 
 def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float = _DECISIVE) -> Sun | None:
-    """Find the sun whose shadows a level surface shows; None where none is decisively better than no sun.
+    """Find the sun whose shadows a level surface shows.
 
     Args:
-        captured: With everything that cast shadows when the scene was captured.
-        region: Around the place; the surface and what stands on it lie within.
-        decisive: Least evidence.
+        captured: The scene with all objects that cast shadows during the capture.
+        region: Sphere around the place that contains the surface and the occluders on it.
+        decisive: Minimum log likelihood over that of no sun.
+
+    Returns:
+        The sun; None if no direction is decisively better than no sun.
     """
     surface = find_surface(captured, region)
     if surface is None:
@@ -303,12 +311,12 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
     blurred_ambient = _blurred(ambient[None])
     without = max(0.0, float(fine.log_likelihoods(blurred_ambient)))
     directions = _DIRECTIONS[_DIRECTIONS @ normal > _LOWEST]
-    parts = directions.split(_AT_ONCE)
+    parts = directions.split(64)  # bounds memory
     every = coarse.every
     visible = (surface.shadows(standing, part, every) for part in parts)
     score = torch.cat([coarse.of_suns(one, ambient[::every, ::every], _STRENGTHS) for one in visible])
     best, evidence = directions[0], -math.inf
-    for _ in range(_MODES):
+    for _ in range(4):  # maxima that are refined
         if float(score.max()) < _PROMISING:
             break
         mode = directions[score.argmax()]
@@ -330,17 +338,17 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
 
 
 def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
-    """The sun that throws the shadows of some points where someone says that they lie.
+    """Make the sun that casts the shadows of some points at other given points.
 
-    Its direction is the mean over the pairs, its error their spread. Radius and strength are measured at the edges of
-    the shadows around the first pair where a level surface shows such edges.
+    The direction is the mean over the pairs, the error their spread. Radius and strength are measured at the edges of
+    shadows around the first pair beside which a level surface shows such edges.
 
     Args:
-        points: Pairs, world units: a point of what casts a shadow, then the same point of its shadow.
-        captured: With what casts the shadows.
+        points: Pairs, world units: a point that casts a shadow, then the same point of its shadow.
+        captured: The scene with the objects that cast the shadows.
 
     Raises:
-        ValueError: The points are no pairs, or a shadow lies higher than what casts it.
+        ValueError: The points are not pairs, or a shadow lies higher than the point that casts it.
     """
     pairs = torch.tensor(points).reshape(-1, 3)
     if len(pairs) % 2 or not len(pairs):
@@ -372,12 +380,12 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
 def _radius_and_ratio(
     picture: SurfacePicture, standing: Occluders, ambient: Float[Tensor, "s s"], direction: Float[Tensor, "3"]
 ) -> tuple[float, Float[Tensor, "3"] | None]:
-    """Angular radius of a sun, degrees, and its irradiance over that of all other light; None where no edge is seen."""
+    """Measure a sun's angular radius, degrees, and its irradiance over all other light; None if no edge is seen."""
     fine, surface = _Comparison.of(picture, _FINE), picture.surface
     softened = torch.stack([surface.shadows(standing, _cone(direction, radius)).mean(0) for radius in _RADII_DEG])
     by_radius = torch.full((len(_RADII_DEG),), -math.inf)
     blurred = torch.cat([softened, ambient[None]])
-    for _ in range(_BLURS):
+    for _ in range(5):  # widths of the reconstruction's blur
         by_radius = torch.maximum(by_radius, fine.of_suns(blurred[:-1], blurred[-1], _FINE_STRENGTHS))
         blurred = _blurred(blurred)
     radius = _RADII_DEG[int((by_radius > by_radius.max() - _SOFTER).int().argmax())]
@@ -385,14 +393,14 @@ def _radius_and_ratio(
 
 
 def _blurred(visible: Float[Tensor, "k s s"]) -> Float[Tensor, "k s s"]:
-    """Shadows as a reconstruction shows them: edges are a few texels wide."""
+    """Blur the edges of shadows by a few texels, as a reconstruction does."""
     for _ in range(2):
         visible = F.avg_pool2d(visible[:, None], 3, 1, 1, count_include_pad=False)[:, 0]
     return visible
 
 
 def _around(direction: Float[Tensor, "3"], span: float, step: float) -> Float[Tensor, "k 3"]:
-    """A grid of directions, its half width and step in degrees."""
+    """Return a grid of directions; half width `span` and step in degrees."""
     right, down = tangents(direction)
     count = round(span / step)
     offsets = torch.arange(-count, count + 1) * math.radians(step)
@@ -401,7 +409,7 @@ def _around(direction: Float[Tensor, "3"], span: float, step: float) -> Float[Te
 
 
 def _cone(direction: Float[Tensor, "3"], radius_deg: float) -> Float[Tensor, "k 3"]:
-    """Even directions over a disc."""
+    """Return directions spread evenly over a disc."""
     index = torch.arange(_CONE)
     radii = ((index + 0.5) / _CONE).sqrt() * math.tan(math.radians(radius_deg))
     return F.normalize(direction + vogel_offsets(direction, radii, index), dim=1)
@@ -410,7 +418,7 @@ def _cone(direction: Float[Tensor, "3"], radius_deg: float) -> Float[Tensor, "k 
 def lit_over_shaded(
     picture: SurfacePicture, visible: Float[Tensor, "s s"], ambient: Float[Tensor, "s s"]
 ) -> Float[Tensor, "3"] | None:
-    """Irradiance of the sun over that of all other light, from texels on both sides of a shadow's edge.
+    """Measure the sun's irradiance over that of all other light at texels on both sides of a shadow's edge.
 
     Args:
         picture: The surface.
@@ -418,12 +426,12 @@ def lit_over_shaded(
         ambient: Share of all other light that reaches it.
 
     Returns:
-        Per channel, at least 0; None where no edge is seen.
+        The ratio of each channel, at least 0; None if no edge is seen.
     """
     ratios = []
     for one in _Comparison.of(picture, _ACROSS, 1).axes:
         edge = one.of(visible[None])[0]
-        across = edge.abs() > _EDGE
+        across = edge.abs() > 0.9
         sign = edge[across].sign()
         log_first, log_second = (picture.log_rgb.reshape(-1, 3)[side[across]] for side in (one.first, one.second))
         change = (log_second - log_first) * sign[:, None]
@@ -435,12 +443,12 @@ def lit_over_shaded(
 
 
 def with_sun(light: Light, sun: Sun) -> Light:
-    """A light whose sun is the one that shadows show; the irradiance on the surface stays.
+    """Replace the infinitely distant sources of a light by a sun; the irradiance on the surface stays the same.
 
     Args:
-        light: Estimated; its far sources are left out, those at a distance stay.
-        sun: Of the same place; where its ratio is None it is as strong as the suns that it replaces, and not below
-            `_MIN_RATIO_BY_HAND`.
+        light: The estimated light.
+        sun: The sun at the same place. If its ratio is None, it gets the strength of the sources that it replaces, or
+            0.6 of all other light if that is more.
     """
     others = replace(light, sources=tuple(one for one in light.sources if math.isfinite(one.distance)))
     before, shaded = (one.irradiance(sun.normal[None])[0] for one in (light, others))

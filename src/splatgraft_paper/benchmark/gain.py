@@ -1,6 +1,6 @@
-"""Light transfer by one gain per object and channel, from the mean light around its two places; casts no shadow.
+"""Light transfer by one gain for each object and channel: exposure and white balance alone, without shadows.
 
-The simplest light transfer: exposure and white balance.
+The gain is the mean light around the object's new place over that around its old one.
 """
 
 import math
@@ -22,12 +22,10 @@ from splatgraft.relighting.shading import apply_gain
 from splatgraft.runtime.note import Note
 
 # set by hand
-_DARKEST = 1e-4  # linear light, a third of one 8-bit step; darker light counts as this
-_MAX_LOG_GAIN = math.log(4.0)  # logarithm of the largest factor by which a channel is multiplied or divided
-_MAX_LOG_TINT = math.log(1.6)
-"""Logarithm of the largest factor between a channel and the mean of the three; more is likely a coloured wall."""
-_TRUSTED_COVERAGE = 0.5
-"""Share of directions, in [0, 1]; where less was captured the gain is moved towards 1 in proportion."""
+_DARKEST = 1e-4  # linear light, a third of one 8-bit step; lower bound of the mean light
+_MAX_LOG_GAIN = math.log(4.0)  # maximum change of a channel
+_MAX_LOG_TINT = math.log(1.6)  # maximum difference of a channel from the mean; more is likely a coloured wall
+_TRUSTED_COVERAGE = 0.5  # captured share of the directions below which the gain is moved towards 1 in proportion
 
 
 @dataclass(frozen=True)
@@ -39,19 +37,9 @@ class LocalGain:
     source_coverage: float
     """Share of the old light's directions that the source's capture covers, in [0, 1]."""
     target_coverage: float
-    """The same of the new light in the target."""
+    """Share of the new light's directions that the target's capture covers, in [0, 1]."""
     held_back: bool
     """Whether a limit or missing coverage made the gain smaller than measured."""
-
-    def describe(self) -> str:
-        """One line for a report."""
-        r, g, b = self.gain.tolist()
-        text = (
-            f"Exposure and white balance: red x{r:.2f}, green x{g:.2f}, blue x{b:.2f}. "
-            f"Directions of light that were never photographed: {1 - self.source_coverage:.0%} in the source, "
-            f"{1 - self.target_coverage:.0%} in the target."
-        )
-        return text + (" The measured change was larger and was held back." if self.held_back else "")
 
 
 def relight_by_gain(
@@ -61,12 +49,12 @@ def relight_by_gain(
 
     Args:
         composite: Target scene and placed objects.
-        cameras: Of the target's capture.
-        sources: Per object the scene that it was taken from; None where that is not known.
+        cameras: The cameras of the target's capture.
+        sources: For each object the scene that it was taken from; None if that is unknown.
 
     Returns:
-        The composite and a note on each object. An object stays as it was captured where its source is not known or
-        there is no light at one of its places, and a warning gives the reason.
+        The composite and a note on each object. If an object's source is unknown or if there is no light at one of its
+        places, it stays as it was captured, and a warning gives the reason.
 
     Raises:
         ValueError: There is not one source (or None) per object.
@@ -79,15 +67,25 @@ def relight_by_gain(
         found = _gain_of(placed, source, scene, cameras)
         if isinstance(found, LocalGain):
             recolored.append(apply_gain(placed.gaussians, found.gain))
-            notes.append(Note(f"Object {number}: {found.describe()}"))
+            notes.append(Note(f"Object {number}: {_describe(found)}"))
         else:
             recolored.append(placed.gaussians)
             notes.append(Note(f"Object {number}: {found} It is pasted as it is.", "warning"))
     return composite.with_object_colors(tuple(recolored)), tuple(notes)
 
 
+def _describe(found: LocalGain) -> str:
+    r, g, b = found.gain.tolist()
+    text = (
+        f"Exposure and white balance: red x{r:.2f}, green x{g:.2f}, blue x{b:.2f}. "
+        f"Directions of light that were never photographed: {1 - found.source_coverage:.0%} in the source, "
+        f"{1 - found.target_coverage:.0%} in the target."
+    )
+    return text + (" The measured change was larger and was held back." if found.held_back else "")
+
+
 def _gain_of(placed: PlacedObject, source: SourceScene | None, scene: Gaussians, cameras: Cameras) -> LocalGain | str:
-    """The gain from the object's old place to its new one, or a sentence that gives the reason why there is none."""
+    """Compute the gain from the object's old place to its new one, or say why it is unknown."""
     if not placed.gaussians.count:
         return "It is empty."
     if source is None:
@@ -105,11 +103,11 @@ def _gain_of(placed: PlacedObject, source: SourceScene | None, scene: Gaussians,
 def local_gain(
     source: Panorama, target: Panorama, *, source_up: Float[Tensor, "3"], target_up: Float[Tensor, "3"]
 ) -> LocalGain:
-    """The mean light at an object's new place over that at its old one, per channel, in linear light, limited.
+    """Divide the mean light at an object's new place by that at its old one, for each channel, within limits.
 
     Args:
         source: Panorama at the old place, with the object removed.
-        target: Panorama at the new place. The gain is 1 where either covers nothing.
+        target: Panorama at the new place. The gain is 1 if one of the two covers nothing.
         source_up: Unit, in the source's frame.
         target_up: Unit, in the target's frame.
     """
@@ -125,10 +123,10 @@ def local_gain(
 
 
 def mean_light(panorama: Panorama, up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], float]:
-    """Mean radiance that reaches a dome on a surface, and the coverage of the directions that light it.
+    """Average the radiance that reaches a dome on a surface.
 
     The mean over all normals of the upper hemisphere weights light from direction d by (1 + d . up) / 2, the integral
-    of the clamped cosine. Directions that were not captured are assumed to be as bright as the rest.
+    of the clamped cosine. Uncaptured directions count as bright as the mean of the others.
 
     Args:
         panorama: At the dome's place.
