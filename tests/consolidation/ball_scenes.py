@@ -53,7 +53,7 @@ def views_of(scene: Gaussians, cameras: Cameras, images: Sequence[Tensor], **cha
 
 
 def basis_towards(scene: Gaussians, camera: Cameras) -> Tensor:
-    """Spherical harmonics of every Gaussian in the direction from the camera."""
+    """Return spherical harmonics of every Gaussian in the direction from the camera."""
     directions = torch.nn.functional.normalize(scene.means - camera.centers, dim=-1)
     return spherical_harmonics.basis(directions, scene.sh_degree)
 
