@@ -25,7 +25,7 @@ SPANS = (3.0, 5.0, 12.0)
 
 
 def gains(scene: ExamScene, choices: list[ShadeSettings]) -> list[float]:
-    """Gain of the object's PSNR over pasting, dB, for each choice."""
+    """Return the gain of the object's PSNR over pasting, dB, for each choice."""
     pasted = measure_row(make_row("paste", scene)[0], scene.views)["object"]
     relit = relight(scene.composite, scene.cameras, sources=[scene.source])
     source = relit.prepared[0].source_lighting if relit.prepared else None

@@ -28,7 +28,7 @@ pytestmark = [
 ADDON = Path(__file__).parents[2] / "blender_addon" / "splatgraft_addon.py"
 SUN = torch.nn.functional.normalize(torch.tensor([-0.39, 0.67, 0.8]), dim=0)
 CAPTURE_FROM_WORLD = torch.tensor([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
-"""Write a capture in the axes of structure from motion, y down."""
+"""Rotation into the axes of a capture by structure from motion, y down."""
 
 
 @pytest.fixture(scope="module")

@@ -107,7 +107,7 @@ from colmap_process.job import Job
 folder = Path(sys.argv[2])
 pycolmap.set_random_seed(0)
 """
-"""Check that Pillow is not loaded beside pycolmap, which runs in a process of its own."""
+"""First lines of the programs below. pycolmap shares no process with Pillow, so each runs in a process of its own."""
 
 
 def printed_by(program: str, folder: Path) -> str:
@@ -131,7 +131,7 @@ for i in photos[7:]:
 job = Job(str(folder), "", str(folder), False, [[truth.images[i].name for i in photos]], True, 1, 0)
 assert refined(job, folder / "photos.db", [part]).num_reg_images() == 10
 """
-"""Return a synthetic model without three of its ten photos."""
+"""Refines a synthetic model without three of its ten photos."""
 
 
 def test_photos_that_no_model_holds_are_posed_from_the_points_of_the_others(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ with pycolmap.Database.open(folder / "photos.db") as opened:
 job = Job("", "", str(folder), False, [[image.name for image in truth.images.values()]], True, 2, 0)
 print(_promising_pairs(job, folder / "photos.db").read_text())
 """
-"""Return forty photos that all show the same points, as photos before a still background do."""
+"""Matches forty photos that all show the same points, as photos before a still background do."""
 
 
 def test_where_all_photos_match_each_is_compared_with_its_best_partners_alone(tmp_path: Path) -> None:

@@ -245,7 +245,7 @@ def counted(old, new):
 os.replace = counted
 main(sys.argv[1:])
 """
-"""Return `splatgraft` with frequent checkpoints, which ends after the third."""
+"""Program that runs `splatgraft` with frequent checkpoints, and sleeps forever after the third."""
 
 
 @pytest.mark.long

@@ -1,4 +1,4 @@
-"""Without room on the disk or the right to write, a command ends with one line and keeps earlier files."""
+"""A command without room on the disk, or without the right to write, ends with one line and keeps earlier files."""
 
 import ctypes
 import errno

@@ -24,7 +24,7 @@ from splatgraft.workflow.flow import read_flow
 
 @dataclass(frozen=True)
 class Doubtful:
-    """Write a step that warns with its own picture and with a photo elsewhere."""
+    """Step that warns with its own picture and with a photo elsewhere."""
 
     photo: Path
     out: Path

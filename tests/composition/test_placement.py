@@ -109,7 +109,7 @@ def outward(cameras: Cameras) -> Cameras:
 
 THING = box((0, 0, 0.15), (0.1, 0.1, 0.15))
 OWN = ring_of_cameras((0.0, 0, 0.15), height=0.5)
-"""Return an object and the cameras of its capture."""
+"""Object and the cameras of its capture."""
 
 
 TURN = Similarity(
@@ -456,7 +456,7 @@ def cameras_that_look_at_the_figure():
 
 
 SLENDER = box((0, 0, 0.15), (0.04, 0.04, 0.15), spacing=0.02)
-"""Return an object that would fit on the figure's shoulder."""
+"""Object that would fit on the figure's shoulder."""
 
 
 def test_an_object_stands_beside_the_captured_figure_on_its_table():

@@ -1,4 +1,4 @@
-"""Scenes as .usdz, read back by OpenUSD itself, and beside what NVIDIA's converter makes of the same .ply."""
+"""Scenes as .usdz, read back by OpenUSD itself, and compared with NVIDIA's converter on the same .ply."""
 
 import sys
 
@@ -17,7 +17,7 @@ WRITTEN = TOOLS.parent / "written"
 
 
 def read(path):
-    """Attributes of the Gaussians in a stage, by OpenUSD."""
+    """Return the attributes of the Gaussians in a stage, by OpenUSD."""
     usd = pytest.importorskip("pxr.Usd")
     from pxr import UsdGeom, UsdVol
 
@@ -58,7 +58,7 @@ def test_usd_finds_the_scene_with_y_up(tmp_path):
 
 
 def test_values_are_those_of_another_converter(tmp_path):
-    """usd-convert-gsplat 0.1.15 (NVIDIA, Apache-2.0) takes the .ply as it is; we turn it by half a turn about x."""
+    """usd-convert-gsplat 0.1.15 (NVIDIA, Apache-2.0) keeps the .ply's axes; our writer turns by half a turn about x."""
     pytest.importorskip("pxr.UsdVol")
     theirs = read(WRITTEN / "scene.usd-convert-gsplat.usdc")
     g = formats.read_gaussians(TOOLS / "scene.ply")

@@ -1,4 +1,4 @@
-"""The light at a place: its panorama, the evidence of shading and highlights, the estimate in scenes of known light."""
+"""The light at a place: its panorama, evidence of shading and highlights, estimates in scenes of known light."""
 
 import math
 from dataclasses import replace
@@ -77,7 +77,7 @@ def test_light_is_seen_in_its_direction_in_linear_light():
     seen = render_panorama(scene, torch.zeros(3), size=32)
     assert seen.coverage > 0.99
     above = seen.radiance[seen.directions[..., 2] > 0.3]
-    # blends only like with like away from the border; alpha near 1 leaves 8 bits of float noise
+    # only equal values are blended away from the border; alpha near 1 leaves 8 bits of float noise
     assert (above - linear_from_srgb(torch.tensor([0.9, 0.6, 0.3]))).abs().max() < 2e-3
 
 
@@ -99,7 +99,7 @@ def test_near_things_are_left_out():
 
 
 def test_wide_gaussians_close_by_are_not_smeared_over_the_horizon():
-    # a sky, and under the point a table of discs as wide as they are far
+    # a sky, and under the point a table of discs as wide as their distance
     sky = shell(torch.full((3000, 3), 0.7), even_directions(3000), radius=6.0, spread=0.36)
     x = torch.linspace(-0.6, 0.6, 5)
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
@@ -126,12 +126,12 @@ def high_views():
 
 
 def polished(looks, sun):
-    """A lobe of cos^16 around the mirrored sun, for unit directions from a camera down to the plane."""
+    """Return a lobe of cos^16 around the mirrored sun, for unit directions from a camera down to the plane."""
     return ((looks * torch.tensor([1.0, 1.0, -1.0])) @ sun).clamp_min(0) ** 16
 
 
 def rough(looks, sun):
-    """Light that a rough dielectric reflects: GGX of alpha .5 with Smith's masking of both sides and Fresnel."""
+    """Return the reflection of a rough dielectric: GGX of alpha .5 with Smith's masking of both sides and Fresnel."""
     alpha, view = 0.5, -looks
     half = torch.nn.functional.normalize(view + sun, dim=1)
     spread = alpha**2 / (math.pi * (half[:, 2] ** 2 * (alpha**2 - 1) + 1) ** 2)
@@ -145,7 +145,7 @@ def rough(looks, sun):
 
 
 def table(sun, gloss, reflected=polished):
-    """A plane whose harmonics of degree 3 hold a diffuse gray and what it reflects of `sun`."""
+    """Return a plane whose harmonics of degree 3 hold a diffuse gray and its reflection of `sun`."""
     generator = torch.Generator().manual_seed(0)
     points = torch.cat([(torch.rand(3000, 2, generator=generator) - 0.5) * 2, torch.zeros(3000, 1)], 1)
     looks = even_directions(600)
@@ -183,7 +183,7 @@ def test_highlights_on_a_bare_table_give_the_direction(azimuth):
     assert math.degrees(math.acos(float(best @ sun))) < 12
     assert float(explained.max()) > 0.5
     assert float(explained[7]) == pytest.approx(evidence.explained(single[7]), abs=1e-4)
-    # a light beside it changes the share as when it is computed anew
+    # adding a light changes the share as much as computing it anew
     index = torch.arange(0, len(single), 20)
     both = 2 * single[explained.argmax()] + 3 * single[index]
     more = evidence.explained_with_more(2 * single[explained.argmax()], index, 3 * torch.ones(len(index)))
@@ -191,14 +191,14 @@ def test_highlights_on_a_bare_table_give_the_direction(azimuth):
 
 
 def test_a_rough_table_gives_the_height_of_a_sun_though_it_is_brightest_at_flat_views():
-    """Along the mirrored direction alone the sun is found 14 degrees too low."""
+    """A lobe along the mirrored direction alone puts the sun 14 degrees too low."""
     sun = towards(50, 1.0)
     best = DIRECTIONS[explained_by_each(evidence_of(table(sun, gloss=0.6, reflected=rough))).argmax()]
     assert math.degrees(math.acos(float(best @ sun))) < 12
 
 
 def test_each_material_has_its_own_gloss():
-    """One gloss for all explains what the glossy half shows by half, as the matt half denies it."""
+    """One gloss for all surfaces explains half of the glossy half's change, because the matt half denies it."""
     sun = towards(38, 1.0)
     glossy = table(sun, 0.4).select(torch.arange(1500))
     matt = table(sun, 0.0).select(torch.arange(1500, 3000))
@@ -212,7 +212,7 @@ def test_each_material_has_its_own_gloss():
 def test_matt_tables_and_flat_colours_have_no_highlights():
     scene = table(UP, gloss=0.0)
     evidence = find_highlights(CapturedScene(scene, high_views()), region=REGION)
-    # what is left is the rounding of float32, 1e-5
+    # the rest is the rounding of float32, 1e-5
     assert evidence is None or evidence.variance < 1e-10
     assert find_highlights(CapturedScene(scene.with_sh_degree(0), high_views()), region=REGION) is None
 
@@ -221,7 +221,7 @@ COUNT = len(DIRECTIONS)
 
 
 def receivers(points: torch.Tensor, visibility: torch.Tensor | None = None) -> ShadingEvidence:
-    """Gray, level surfaces."""
+    """Return gray, level surfaces."""
     n = len(points)
     return ShadingEvidence(
         region=BoundingSphere(torch.zeros(3), 1.0),
@@ -235,7 +235,7 @@ def receivers(points: torch.Tensor, visibility: torch.Tensor | None = None) -> S
 
 
 def surroundings(clipped: torch.Tensor) -> Surroundings:
-    """All seen, gray but for what is clipped, and far away."""
+    """Return a panorama that is all seen and far away, gray except for clipped parts."""
     radiance = torch.where(clipped > 0, 1.0, 0.3)[:, None].repeat(1, 3)
     return Surroundings(radiance, torch.ones(COUNT), clipped, DIRECTIONS, torch.full((COUNT,), 1e4))
 
@@ -282,7 +282,7 @@ def test_a_window_above_its_reflection_on_a_table_may_be_a_source():
 
 
 def views(levels=(0.0,)):
-    """Twelve cameras on one circle, for each level that they look at."""
+    """Return twelve cameras on one circle, for each level that they look at."""
     eyes = ring().centers
     poses = torch.cat([look_at(eyes, torch.tensor([0.0, 0.0, level]), UP) for level in levels])
     return pinhole(poses, 100.0, width=128, height=96)
@@ -296,7 +296,7 @@ def estimated(scene, cameras=None) -> Light:
 
 
 def main_direction(light):
-    """Of most irradiance."""
+    """Return the source of most irradiance."""
     normals = even_directions(2000)
     return normals[light.irradiance(normals).sum(1).argmax()]
 
@@ -305,9 +305,9 @@ def main_direction(light):
 def test_shadows_give_the_direction_of_a_sun_that_no_camera_saw(azimuth):
     sun = torch.nn.functional.normalize(torch.tensor([0.78 * math.cos(azimuth), 0.78 * math.sin(azimuth), 0.8]), dim=0)
     light = estimated(sunlit_scene(sun, strength=3.0))
-    # the shadows are three texels' width off their true edge at most, of some fifteen that a ball is high
+    # the shadows are at most three texels off their true edge; a ball is some fifteen high
     assert degrees_apart(torch.tensor(light.sources[0].direction), sun) < 3
-    # by the shadows 3 cos of the sky's light; found too low, as Gaussians mix lit and shaded floor at the edges
+    # by the shadows 3 cos of the sky's light; too low, because Gaussians mix lit and shaded floor at the edges
     on_floor = light.irradiance(UP[None]).mean()
     share = sum(light.sources[0].irradiance) / 3 * light.sources[0].direction[2] / on_floor
     assert float(share) == pytest.approx(3 * float(sun[2]) / (1 + 3 * float(sun[2])), abs=0.1)
@@ -318,7 +318,7 @@ def degrees_apart(one, other):
 
 
 def painted(scene, gray):
-    """The floor of a scene times a gray of its x and y."""
+    """Return the floor of a scene times a gray of its x and y."""
     on_floor = scene.means[:, 2] < 0.02
     color = linear_from_srgb(rgb_from_dc(scene.sh[:, 0])) * torch.where(on_floor, gray(scene.means), 1)[:, None]
     return replace(scene, sh=dc_from_rgb(srgb_from_linear(color))[:, None])
@@ -331,7 +331,7 @@ def sun_of(scene):
 def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s_edge_shows():
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     scene, tops = sunlit_scene(sun, 3.0), torch.tensor([[1.0, 0.2, 0.5], [-0.6, 0.9, 0.5]])
-    # named a little beside where they are
+    # named a little beside the true points
     off = torch.tensor([0.02, -0.01, 0.0])
     points = [tuple(at.tolist()) for top in tops for at in (top + off, top - sun * top[2] / sun[2])]
     found = set_sun(points, CapturedScene(scene, views()))
@@ -347,7 +347,7 @@ def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s
         set_sun(points[::-1], CapturedScene(scene, views()))
     with pytest.raises(ValueError, match="expected pairs"):
         set_sun(points[:3], CapturedScene(scene, views()))
-    # far from all surfaces there is no edge: only the direction is taken from the points
+    # far from all surfaces there is no edge: the points give only the direction
     away = [(20.0 + x, y, z) for x, y, z in points]
     assert set_sun(away, CapturedScene(scene, views())).ratio is None
 
@@ -381,7 +381,7 @@ def test_an_even_sky_gives_an_even_light():
 
 
 def windowed_room(window, radius_deg, white=1.0):
-    """A shell of radius 20 with a bright disc towards `window`, and a floor that it lights."""
+    """Return a shell of radius 20 with a bright disc towards `window`, and a floor that it lights."""
     shell = even_directions(6000)
     bright = shell @ window > math.cos(math.radians(radius_deg))
     rgb = torch.where(bright[:, None], white, 0.4).repeat(1, 3)
@@ -397,7 +397,7 @@ def test_a_clipped_window_is_a_source_where_it_was_photographed(radius_deg, whit
     # brighter than the camera recorded: white over its solid angle is 0.095
     assert main.luminance > 0.2
     assert main.name == "window"  # a room's wall is behind it
-    if radius_deg == 14:  # wide enough that it is no sun behind a window
+    if radius_deg == 14:  # too wide to be a sun behind a window
         assert main.distance == pytest.approx(20, rel=0.05)
 
 
@@ -425,7 +425,7 @@ def test_a_white_floor_is_no_source(strength):
     found = estimate_light(CapturedScene(bright, views((0.0, 1.5))), place)
     assert isinstance(found, EstimatedLight)
     assert all(source.direction[2] > 0 for source in found.mean.sources)
-    # its light still arrives: more on what faces it than on what faces away
+    # its light still arrives: more on surfaces that face it than on those that face away
     towards, away = found.mean.irradiance(torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])).mean(1)
     assert float(towards) > 1.5 * float(away)
 
@@ -458,7 +458,7 @@ def test_a_harmonic_fit_of_half_the_sphere_recovers_an_even_light():
     ambient = fit_ambient(torch.tensor([0.2, 0.3, 0.4]))
     values = torch.tensor([0.2, 0.3, 0.4]).repeat(2000, 1)
     half = (around[:, 2] < 0).float()
-    # the ridge takes a few parts in 1e3 where half is unseen
+    # the ridge takes a few parts in 1e3 if half is unseen
     assert torch.allclose(fit_sh(around, values, half), ambient, atol=5e-3)
 
 
@@ -466,7 +466,7 @@ PLACE = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3)
 
 
 def room() -> Gaussians:
-    """A floor in a gray shell."""
+    """Return a floor in a gray shell."""
     generator = torch.Generator().manual_seed(0)
     floor = torch.cat([(torch.rand(4000, 2, generator=generator) - 0.5) * 5, torch.zeros(4000, 1)], 1)
     shell = even_directions(4000)
@@ -500,7 +500,7 @@ def test_values_that_are_not_finite_or_huge_leave_the_light_finite(field, value)
 @pytest.mark.long
 def test_the_light_of_a_room_is_the_same_from_two_runs_of_poses(tmp_path):
     pytest.importorskip("pycolmap")
-    # of the shipped ones, half as large, fewer get a pose
+    # half of the shipped photographs, in half the size, get fewer poses
     photos = Path(__file__).parents[3] / "shared" / "data" / "bananas" / "images"
     if not photos.is_dir():
         pytest.skip(f"no {photos}")
