@@ -36,7 +36,7 @@ def test_blending_colours_is_rendering():
     # float32 colours of a few units, made by two routines
     assert (operator.blend(colors) - picture.color[0]).abs().max() < 1e-5
     assert (operator.alpha - picture.alpha[0]).abs().max() < 1e-6
-    # the renderer does not know what the early stop and the last pixel test omit
+    # the renderer's `visible` includes Gaussians that the early stop and the last pixel test omit
     assert not (operator.visible & ~picture.visible[0]).any()
     assert torch.equal(operator.visible, (operator.blend_transpose(torch.ones(29, 37, 1)) > 0)[:, 0])
     assert isinstance(operator, ViewOperator)
