@@ -1,7 +1,7 @@
 # make install: the package in .venv; make demo: a whole transfer on shipped captures;
 # make dev: also what the checks need; make test: all checks but the long ones, 9 minutes on two idle cores;
 # make test-all: the long ones too, and shapes checked at every call; make test-fast: pytest alone without a browser;
-# make blender: Blender as a Python module in .venv-blender, for `splatgraft synth --blender-python`;
+# make blender: Blender as a Python module in .venv-blender, for `splatgraft paper synth --blender-python`;
 # make exam NUMBER=...: the light transfer measured on new scenes drawn from a number that no exam has used;
 # make browser: Chromium, for the editor's tests.
 SHELL := /bin/bash

@@ -1,21 +1,20 @@
-"""Held-out quality, time and memory of reconstructions: `python benchmarks/captures.py FOLDER [--quality draft ..]`.
+"""Measure quality, time and memory of reconstructions: `python benchmarks/captures.py FOLDER [--quality draft ..]`.
 
-`--device cuda` runs them on a card. Every capture in FOLDER (with poses: transforms.json or COLMAP; without: a folder
-of photos, posed first by `splatgraft capture`) is reconstructed in a process of its own with every 8th view held out.
-One line each:
+Every capture in FOLDER is reconstructed in a process of its own, with every 8th view held out. Captures without poses
+(a folder of photos) are first posed by `splatgraft capture`. `--device cuda` uses a card. One line each:
 
     capture=NAME quality=standard device=cpu views=9 longest_px=960 psnr=.. psnr_fit=.. ssim=.. flip=.. seconds=.. ..
 
-psnr, ssim and flip compare with the views as photographed; psnr_fit after the colours of each render were mapped to its
-photo by a least-squares affine map, which leaves exposure and white balance out. CPU seconds count all threads of the
-reconstruction; structure from motion is not part of either time.
+psnr, ssim and flip compare with the photographed views. psnr_fit first maps the colours of each render to its photo by
+a least-squares affine map, which removes exposure and white balance. CPU seconds count all threads of the
+reconstruction; neither time includes structure from motion.
 
-With `--object` the object is cut by the masks of the photos that were not held out (the capture's own, or `--masks
-FOLDER` by their names), fitted alone as `segment` does, and compared inside the masks of those held out, before (`cut`)
-and after: two more lines, of which the seconds are those of cutting and fitting alone.
+`--object` cuts the object by the masks of the fitted photos (the capture's own, or `--masks FOLDER` by their names) and
+fits it alone as `segment` does. Two more lines compare it inside the held-out masks, before (`cut`) and after. Their
+seconds are those of cutting and fitting alone.
 
-Every quality fits photos of its own size, and is compared at that size unless `--longest-px` gives others, one line for
-each: small pictures are easier to match, so that figures of two qualities can be compared at one size only.
+Every quality fits photos of its own size, and is compared at that size. `--longest-px` gives other sizes, one line for
+each. Small pictures are easier to match, so figures of two qualities can be compared at one size only.
 """
 
 import argparse
@@ -48,7 +47,7 @@ FEWEST_PHOTOS = 3
 
 
 def find_captures(folder: Path) -> list[Path]:
-    """Folders with poses, and folders of photos, at or below `folder`; nothing below a capture is one."""
+    """Return folders with poses and folders of photos, at or below `folder` but not below another capture."""
     if has_poses(folder) or len(list_images(folder)) >= FEWEST_PHOTOS:
         return [folder]
     below = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
@@ -56,12 +55,12 @@ def find_captures(folder: Path) -> list[Path]:
 
 
 def name_of(capture: Path) -> str:
-    """The folder's name; its parent's where it only says that images are in it."""
+    """Return the folder's name, or its parent's if the name only means images."""
     return capture.resolve().parent.name if capture.name in {"images", "photos"} else capture.resolve().name
 
 
 def posed(capture: Path, work: Path) -> Path:
-    """`capture`, or what `splatgraft capture` makes of it in `work`, where an earlier result is used again."""
+    """Return `capture` if it has poses, else the result of `splatgraft capture` in `work`, which is kept."""
     if has_poses(capture):
         return capture
     out = work / name_of(capture)
@@ -73,7 +72,7 @@ def posed(capture: Path, work: Path) -> Path:
 
 
 def measure(name: str, args: argparse.Namespace) -> None:
-    """Reconstruct and print a line for each size; without sizes, for the size at which the photos were fitted."""
+    """Reconstruct and print a line for each size, by default the size of the fitted photos."""
     capture, line = read_capture(args.folder), f"capture={name} quality={args.quality[0]} device={args.device}"
     options = ReconstructOptions(quality=args.quality[0], eval_every=EVERY, device=args.device)
     reset_peak_memory()
@@ -98,13 +97,13 @@ def measure(name: str, args: argparse.Namespace) -> None:
 
 
 def cost_since(begin: float, begin_cpu: float, made: Gaussians) -> str:
-    """The part of the line that says what something took."""
+    """Return the part of the line with time and memory."""
     seconds, cpu = time.perf_counter() - begin, time.process_time() - begin_cpu
     return f"seconds={seconds:.0f} cpu_seconds={cpu:.0f} gaussians={made.count}"
 
 
 def compare(scene: Gaussians, photos: PosedImages) -> str:
-    """The part of the line that says how close the renders come to the photos."""
+    """Return the part of the line with the errors of renders against the photos."""
     rows: list[tuple[float, ...]] = []
     for i in range(len(photos)):
         truth = photos.image(i)
@@ -120,11 +119,11 @@ def compare(scene: Gaussians, photos: PosedImages) -> str:
 
 
 _BACKGROUNDS = {"grey": (0.5, 0.5, 0.5), "black": (0.0, 0.0, 0.0), "magenta": (1.0, 0.0, 1.0)}
-"""Background colours, sRGB; the see-through parts of an object differ between them."""
+"""Background colours, sRGB. They show the transparent parts of an object."""
 
 
 def compare_object(found: Gaussians, photos: PosedImages) -> str:
-    """The part of the line that says how close the object comes to the photos inside its masks, by background."""
+    """Return the part of the line with the object's errors inside its masks, by background."""
     rows: list[tuple[float, ...]] = []
     for i in range(len(photos)):
         mask = photos.mask(i)

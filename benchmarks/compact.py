@@ -1,4 +1,4 @@
-"""Time of the compact harmoniser on a CPU, with random images and weights: `python benchmarks/compact.py`.
+"""Measure the time of the compact harmoniser on a CPU, with random images and weights: `python benchmarks/compact.py`.
 
 Prints the core-seconds per view at 704x496, and those of the network alone.
 """

@@ -1,9 +1,12 @@
-"""The `fast` method of consolidation against 10K iterations of Adam: `python benchmarks/consolidate.py [CAPTURE]`.
+"""Compare the `fast` method of consolidation with 10K iterations of Adam: `python benchmarks/consolidate.py [CAPTURE]`.
 
-A scene is reconstructed from the capture (kept in build/), its colours are changed as a naive composite's are wrong,
-and both methods fit them to the photographs again, with the same loss. Every 8th view is held out of all steps. Then
-losses are compared on photographs that disagree as independently harmonised views do. The last line reads
-speedup=.. error_ratio=.. peak_mb=.., where error_ratio is the larger of the ratios of held-out loss and held-out RMSE.
+1. A scene is reconstructed from the capture (kept in build/). Every 8th view is held out of all steps.
+2. Its colours are changed like those of a naive composite. Both methods fit them to the photographs again, with the
+   same loss.
+3. Losses are compared on photographs that disagree like independently harmonised views.
+
+The last line reads speedup=.. error_ratio=.. peak_mb=... error_ratio is the larger of the ratios of held-out loss and
+held-out RMSE.
 """
 
 import argparse
@@ -34,7 +37,7 @@ LOSSES: dict[str, ImageLoss] = {"fourier": windowed_fourier, "l1-dssim": l1_dssi
 
 @dataclass(frozen=True)
 class Problem:
-    """A composite with wrong colours, the views that it is fitted to, and held-out views."""
+    """A composite with wrong colours, its fitted views, and held-out views."""
 
     composite: Gaussians
     cameras: Cameras
@@ -43,12 +46,12 @@ class Problem:
     test_images: list[Tensor]
 
     def pictures(self, scene: Gaussians) -> list[Tensor]:
-        """Renders from the held-out cameras."""
+        """Return renders from the held-out cameras."""
         with torch.no_grad():
             return [render(scene, camera).color[0].clamp(0, 1) for camera in self.test_cameras]
 
     def errors(self, scene: Gaussians, loss: ImageLoss) -> tuple[float, float, float, float]:
-        """Held out: mean loss, RMSE over all pixels, mean PSNR, gradient energy over that of the photographs."""
+        """Return held-out mean loss, RMSE over all pixels, mean PSNR, and gradient energy over the photographs'."""
         pairs = list(zip(self.pictures(scene), self.test_images, strict=True))
         squares = sum(float(((a - b) ** 2).mean()) for a, b in pairs) / len(pairs)
         energy = sum(gradient_energy(a) for a, _ in pairs) / sum(gradient_energy(b) for _, b in pairs)
@@ -70,7 +73,7 @@ def scene_of(capture: PosedImages, cache: Path, iterations: int) -> Gaussians:
 
 
 def spoilt(scene: Gaussians, seed: int = 0) -> Gaussians:
-    """Colours under another light: a smooth gain over space of about 25%, and noise."""
+    """Return colours under another light: a smooth gain over space of about 25%, and noise."""
     generator = torch.Generator().manual_seed(seed)
     extent = scene.means.std(0).mean()
     waves = (scene.means / extent) @ torch.randn(3, 3, generator=generator)
@@ -81,7 +84,7 @@ def spoilt(scene: Gaussians, seed: int = 0) -> Gaussians:
 
 
 def disagreeing(images: list[Tensor], warp_px: float, cell_px: float, seed: int = 0) -> list[Tensor]:
-    """Each image with its own warp, gain (8%), tint (4%) and blur (up to 0.6 px)."""
+    """Return each image with its own warp, gain (8%), tint (4%) and blur (up to 0.6 px)."""
     return [_spoil_view(image, warp_px, cell_px, seed * 1000 + index) for index, image in enumerate(images)]
 
 
@@ -119,7 +122,7 @@ def problem_of(capture: PosedImages, scene: Gaussians) -> Problem:
 
 
 def compare_methods(problem: Problem, loss: ImageLoss, iterations: int) -> str:
-    """Both methods on photographs that agree."""
+    """Compare both methods on photographs that agree."""
     options = ConsolidateOptions(loss=loss, view_error=False)
     consolidate(problem.composite, problem.cameras[:2], problem.images[:2], options)  # compiles the kernels
     runs = {
@@ -141,14 +144,14 @@ def compare_methods(problem: Problem, loss: ImageLoss, iterations: int) -> str:
             flush=True,
         )
     fast, paper = results["fast"], results["paper"]
-    # `fast` without tint and flow, so that both methods minimise the same loss; CPU time, since other load during one
-    # of the runs would distort wall times
+    # `fast` without tint and flow, so that both methods minimise the same loss; CPU time, because other load during
+    # one of the runs would distort wall times
     ratio = max(fast[3] / paper[3], fast[4] / paper[4])
     return f"speedup={paper[1] / fast[1]:.1f} error_ratio={ratio:.3f} peak_mb={fast[2]:.0f}"
 
 
 def compare_losses(problem: Problem, passes: int) -> None:
-    """Quality of each loss where the views disagree, measured on held-out photographs that agree."""
+    """Compare losses on views that disagree, measured on held-out photographs that agree."""
     losses = dict(LOSSES)
     try:
         losses["lpips"] = lpips_vgg()

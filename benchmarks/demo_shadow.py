@@ -1,11 +1,14 @@
-"""Compares the shadow of the bananas in a finished demo with the cup's beside it: darkness, and width of the edge.
+"""Compare the bananas' shadow in a finished demo with the cup's beside it: darkness, and width of the edge.
 
     splatgraft demo demo && python benchmarks/demo_shadow.py demo [demo-of-another-version ...]
 
-The table is rendered and its sun is known (data/render_table.py), so that it is known which texels of the table top
-each of the two shades. Darkness: the median of luminance in the core of a shadow over luminance without it, which is
-for the cup that of the lit table, and for the bananas the same texel without them. Width: the distance over which the
-mean profile of that ratio across the edge goes from a fifth to four fifths of the way.
+The sun of the rendered table is known (data/render_table.py), so it is known which texels of the table top the cup and
+the bananas shade.
+
+- Darkness: median of luminance in the core of a shadow over luminance without the shadow. The latter is the lit table's
+  for the cup, and the same texel's without the bananas for the bananas.
+- Width: distance over which the mean profile of that ratio across the edge goes from a fifth to four fifths of its
+  change.
 """
 
 import argparse
@@ -29,21 +32,21 @@ from splatgraft.relighting.light.sun import SurfacePicture, draw_surface, find_s
 from splatgraft.relighting.shadows.shadow_maps import occluders_of
 
 SUN = F.normalize(torch.tensor([-0.26938, 0.91658, 0.29548]), dim=0)
-"""Towards the sun of data/render_table.py."""
+"""Direction towards the sun of data/render_table.py."""
 _RADII = 6.4  # object radii of the region around the table
 _CORE, _REACH = 3, 14
-"""Texels: distance from the edge from which on a shadow is at its darkest, and up to which the profile is taken."""
+"""Distances from the edge, texels: the minimum at which a shadow is darkest, and the maximum of the profile."""
 
 
 def luminance(picture: SurfacePicture) -> Float[Tensor, "s s"]:
-    """Linear, nan where the surface is not seen."""
+    """Return linear luminance, nan if the surface is not seen."""
     return torch.where(picture.valid, picture.log_rgb.exp() @ LUMINANCE, math.nan)
 
 
 def measured(
     ratio: Float[Tensor, "s s"], visible: Float[Tensor, "s s"], apart: Bool[Tensor, "s s"]
 ) -> tuple[float, float]:
-    """Darkness in the core, and the width of the edge in texels; `apart` is where another shadow is near."""
+    """Return darkness in the core, and the width of the edge in texels. `apart` marks texels near another shadow."""
     shaded = visible.numpy() < 0.5
     away = np.asarray(distance_transform_edt(shaded)) - np.asarray(distance_transform_edt(~shaded))
     known = ~(ratio.isnan() | apart).numpy()
@@ -58,7 +61,7 @@ def measured(
 
 
 def shadows_of(demo: Path, folders: tuple[str, ...]) -> Iterator[tuple[str, float, float]]:
-    """Name, darkness and width of the edge in mm of the cup's shadow, and of the bananas' in results of a demo."""
+    """Yield name, darkness and edge width in mm of the cup's shadow, and of the bananas' in results of a demo."""
     composite = read_composite(demo / "target" / "scene" / "scene.ply", demo / "composite" / "placement.json")
     cameras = read_cameras(demo / "target" / "capture" / "transforms.json")
     scene, placed = composite.target, composite.objects[0].in_target()

@@ -1,12 +1,14 @@
-"""Times of the editor as a browser sees them: start, first picture, a moved view, a dragged object and its light.
+"""Measure times of the editor: start, first picture, a moved view, a dragged object and its light.
 
-`python benchmarks/editor.py [--against SRC] [COUNT ...]`. With another checkout's `src` both are measured, one after
-the other. For targets of 200,000 Gaussians (or COUNT) it starts `splatgraft edit` on a
-project of two synthetic scenes, the target of SH degree 3, and speaks the page's own protocol through a websocket, at a
-canvas of 1280x720. No browser takes part, so what a browser needs for drawing comes on top. Times are seconds from the
-message that causes a picture to its arrival, medians of REPEATS; `final` is the light as the step computes it. Of a
-large scene the first points are of a sample. A drag is of DRAG_SECONDS: by the requests of the page's script where the
-page has one, else by its gizmo; `draft` and `final` after it count from the release.
+`python benchmarks/editor.py [--against SRC] [COUNT ...]`. `--against` also measures another checkout's `src`.
+
+For targets of 200,000 Gaussians (or COUNT) it starts `splatgraft edit` on a project of two synthetic scenes, with a
+target of SH degree 3. It speaks the page's own protocol through a websocket, at a canvas of 1280x720. No browser takes
+part, so a browser's time for drawing is not included.
+
+Times are seconds from the message that causes a picture to its arrival, medians of REPEATS. `final` is the light as the
+step computes it. The first points of a large scene are a sample. A drag lasts DRAG_SECONDS. It uses the requests of the
+page's script if the page has one, else its gizmo. `draft` and `final` after a drag count from the release.
 """
 
 import argparse
@@ -52,7 +54,7 @@ def ball(count: int) -> Gaussians:
 
 
 def write_project(root: Path, count: int) -> Path:
-    """Two scenes without photographs, and all steps up to the pasted object."""
+    """Write two scenes without photographs, and run all steps up to the pasted object."""
     write_gaussians(root / "source.ply", concatenate([courtyard(20_000), ball(5_000)]))
     write_gaussians(root / "target.ply", courtyard(count).with_sh_degree(3))
     project = root / "project" / "project.toml"
@@ -68,10 +70,10 @@ def write_project(root: Path, count: int) -> Path:
 
 
 class Client:
-    """What a browser sends and receives."""
+    """Websocket client that speaks the page's protocol."""
 
     def __init__(self, address: str) -> None:
-        """Connect; nothing is sent yet."""
+        """Connect without sending anything."""
         base, _, query = address.partition("/?")
         self.address = address
         self._socket: ClientConnection = connect(
@@ -80,7 +82,7 @@ class Client:
             subprotocols=["viser-v1.1.1"],  # pyright: ignore[reportArgumentType]
             max_size=None,
             open_timeout=HANG_LIMIT,
-            # what is not read fills the queue, and then no answer to the end arrives
+            # unread messages fill the queue, and then no answer to the close arrives
             close_timeout=1.0,
         )
         self._gui: dict[str, dict[str, Any]] = {}
@@ -113,16 +115,16 @@ class Client:
         )
 
     def set_value(self, label: str, value: Any) -> None:
-        """Change a control, as a user would."""
+        """Change a control."""
         uuid = next(key for key, props in self._gui.items() if props.get("label") == label)
         self.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
     def value(self, label: str) -> Any:
-        """The value of a control."""
+        """Return the value of a control."""
         return next(props for props in self._gui.values() if props.get("label") == label)["value"]
 
     def messages(self, seconds: float) -> Iterator[dict[str, Any]]:
-        """What arrives within a time."""
+        """Yield the messages that arrive within a time."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             try:
@@ -146,11 +148,11 @@ class Client:
             self.scenes.add(message["name"])
 
     def caption(self) -> str:
-        """What the page says about the picture."""
+        """Return the page's label of the picture."""
         return " ".join(str(p.get("content")) for p in self._gui.values() if "sg-caption" in str(p.get("content")))
 
     def script_state(self) -> dict[str, Any]:
-        """What the page's script was told last; empty where the page has none."""
+        """Return the last state sent to the page's script, empty if the page has no script."""
         for props in self._gui.values():
             found = re.search(r'class="sg-state"[^>]*>([^<]*)<', str(props.get("content")))
             if found:
@@ -158,7 +160,7 @@ class Client:
         return {}
 
     def ask(self, what: str, **query: Any) -> bytes:
-        """A request of the page's script."""
+        """Send a request as the page's script would."""
         parts = urlsplit(self.address)
         connection = http.client.HTTPConnection(parts.netloc, timeout=HANG_LIMIT)
         given = urlencode({"window": self.script_state()["window"], **query})
@@ -168,7 +170,7 @@ class Client:
         return answer.read()
 
     def until(self, condition: Callable[[], bool]) -> float:
-        """Seconds until a condition holds."""
+        """Return the seconds until a condition holds."""
         start = time.monotonic()
         while not condition():
             assert time.monotonic() - start < HANG_LIMIT
@@ -178,7 +180,7 @@ class Client:
         return time.monotonic() - start
 
     def picture(self) -> float:
-        """Seconds until the next picture on the canvas."""
+        """Return the seconds until the next picture on the canvas."""
         start = time.monotonic()
         while time.monotonic() - start < HANG_LIMIT:
             for message in self.messages(1.0):
@@ -188,7 +190,7 @@ class Client:
 
 
 def is_picture(message: dict[str, Any]) -> bool:
-    # one without depth is the last picture, behind the splats of a moving view
+    # a picture without depth is the last one, behind the splats of a moving view
     return (
         message["type"] == "BackgroundImageMessage" and message["rgb_data"] is not None and bool(message["depth_data"])
     )
@@ -240,7 +242,7 @@ def _turn(client: Client, angle: float) -> float:
 
 
 def _drag(client: Client) -> dict[str, float]:
-    """Pictures a second during a drag, and the seconds from its end to the draft of the light and to the light."""
+    """Return pictures a second during a drag, and seconds from its end to the draft of the light and to the light."""
     client.until(lambda: is_final(client))
     pictures, start = 0, time.monotonic()
     if client.script_state():
@@ -276,7 +278,7 @@ def _move(client: Client, k: int) -> float:
     x, y, z = client.value("Position")
     start = time.monotonic()
     client.set_value("Position", [x + 0.02 * (1 if k % 2 else -1), y, z])
-    # the picture before is of the pasted object or of the old light
+    # the earlier picture shows the pasted object or the old light
     client.until(lambda: "a draft of the light" in client.caption())
     return time.monotonic() - start
 

@@ -1,4 +1,4 @@
-"""The rendered scenes over which benchmarks/fit_*.py fit, as `splatgraft paper exam` leaves them."""
+"""Rendered scenes for benchmarks/fit_*.py, in the folders that `splatgraft paper exam` writes."""
 
 import argparse
 from collections.abc import Callable, Iterator
@@ -13,7 +13,7 @@ RECONSTRUCTION = ReconstructOptions(iterations=1000, budget=20_000)
 
 
 def scene_arguments(description: str | None) -> argparse.ArgumentParser:
-    """The arguments that name scenes."""
+    """Add the arguments that name scenes."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("scenes", type=Path, nargs="+", help="folders of scenes with known light")
     parser.add_argument("--work", type=Path, nargs="+", required=True, help="their reconstructions, in the same order")
@@ -21,7 +21,7 @@ def scene_arguments(description: str | None) -> argparse.ArgumentParser:
 
 
 def scenes_in(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], ExamScene]]]:
-    """EXAM-SCENE of each scene with known light, and what reads it after it was reconstructed where need be."""
+    """Yield EXAM-SCENE and a reader of each scene with known light, which is reconstructed first if necessary."""
     for folder, work in zip(options.scenes, options.work, strict=True):
         for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file()):
             name = f"{folder.resolve().parent.name}-{path.name}"

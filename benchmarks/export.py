@@ -1,9 +1,9 @@
-"""Size, seconds and PSNR of every format that `splatgraft export` writes, against the .ply.
+"""Measure size, seconds and PSNR of every format that `splatgraft export` writes, against the .ply.
 
 `python benchmarks/export.py PROJECT [--chromium]`. PROJECT is a project's folder, e.g. of `splatgraft demo`.
-PSNR is the mean over eight of the target's views, drawn by our renderer from what our reader finds; of the .html it is
-the picture in Chromium (playwright) against ours, without a network. Sizes of an .html count both scenes and viewer.
-The last line is the scene with band 0 alone.
+PSNR is the mean over eight of the target's views: our reader reads the file and our renderer draws it. For the .html,
+the picture in Chromium (playwright), without a network, is compared with ours. The size of an .html includes both
+scenes and the viewer. The last line is the scene with band 0 alone.
 """
 
 import io
@@ -39,7 +39,7 @@ def mean_psnr(scene: Gaussians, truth: list[torch.Tensor], cameras: Cameras) -> 
 
 
 def page_psnr(path: Path, source: ExportSource) -> tuple[float, float]:
-    """PSNR of the page's first view in Chromium, and seconds until it is drawn."""
+    """Return PSNR of the page's first view in Chromium, and seconds until it is drawn."""
     from PIL import Image
     from playwright.sync_api import sync_playwright
 
@@ -53,7 +53,7 @@ def page_psnr(path: Path, source: ExportSource) -> tuple[float, float]:
         page.wait_for_selector("body[data-state=ready]", timeout=600_000)
         seconds = time.perf_counter() - start
         page.add_style_tag(content="h1, .corner, .bar, #divider { opacity: 0 }")
-        page.keyboard.press("b")  # the result alone, where there are two scenes
+        page.keyboard.press("b")  # the result alone, if there are two scenes
         page.wait_for_selector("body[data-still=true]", timeout=600_000)
         shown = torch.from_numpy(np.array(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))).float() / 255
         browser.close()

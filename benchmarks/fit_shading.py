@@ -1,10 +1,10 @@
-"""Fits the numbers of the object's shading over rendered scenes, and checks them across scenes.
+"""Fit the numbers of the object's shading over rendered scenes, and cross-validate them.
 
-`python benchmarks/fit_shading.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`, with scenes as `splatgraft
-paper exam` renders them. The objective is the mean gain of the object's PSNR over pasting on the held-out views.
-Every combination of a grid is tried; the numbers are chosen with each scene left out in turn, too, and the gain of the
-scene left out is reported. Gloss stays as today's numbers give it. The shares of level and tint have to be chosen on
-scenes that benchmarks/fit_light.py did not see: on its own scenes the light is better than elsewhere.
+`python benchmarks/fit_shading.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`. `splatgraft paper exam` renders the
+scenes. The objective is the mean gain of the object's PSNR over pasting on the held-out views. Every combination of a
+grid is tried. The numbers are also chosen with each scene left out in turn, and the gain of that scene is reported.
+Gloss is not fitted. Choose the shares of level and tint on scenes that benchmarks/fit_light.py did not see, because on
+its own scenes the light is better than elsewhere.
 """
 
 import itertools
@@ -25,7 +25,7 @@ SPANS = (3.0, 5.0, 12.0)
 
 
 def gains(scene: ExamScene, choices: list[ShadeSettings]) -> list[float]:
-    """Of the object's PSNR over pasting, dB, for each choice."""
+    """Return the gain of the object's PSNR over pasting, dB, for each choice."""
     pasted = measure_row(make_row("paste", scene)[0], scene.views)["object"]
     relit = relight(scene.composite, scene.cameras, sources=[scene.source])
     source = relit.prepared[0].source_lighting if relit.prepared else None

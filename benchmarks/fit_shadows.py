@@ -1,11 +1,13 @@
-"""Fits the strength of shadows under an estimated light over rendered scenes, and checks it across scenes.
+"""Fit the strength of shadows under an estimated light over rendered scenes, and cross-validate it.
 
-`python benchmarks/fit_shadows.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`, with scenes as `splatgraft
-paper exam` renders them. A light that is averaged over what is possible has less contrast than the true one, so
-shadows come out too weak. The objective is the share that is removed of pasting's error, the RMSE of the ratio of
-luminance with the object to that without it over all pixels beside the object: a strong shadow in a wrong place costs.
-Every power of a grid is tried; it is chosen with each scene left out in turn, too, and the share of the scene left out
-is reported.
+`python benchmarks/fit_shadows.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]`. `splatgraft paper exam` renders the
+scenes. A light that is averaged over several possibilities has less contrast than the true one, so its shadows are too
+weak.
+
+The objective is the removed share of pasting's error. The error is the RMSE of the ratio of luminance with the object
+to luminance without the object, over all pixels beside it. A strong shadow in a wrong place therefore costs. Every
+power of a grid is tried. The power is also chosen with each scene left out in turn, and the share of that scene is
+reported.
 """
 
 from dataclasses import replace
@@ -25,7 +27,7 @@ POWERS = (1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.6, 1.8, 2.0)
 
 
 def ratio_error(result: Gaussians, scene: ExamScene) -> float:
-    """RMSE of the luminance ratio over all pixels beside the object, mean over views."""
+    """Return the RMSE of the luminance ratio over all pixels beside the object, mean over views."""
     errors = []
     for view in scene.views:
         truth = view.truth
@@ -35,9 +37,9 @@ def ratio_error(result: Gaussians, scene: ExamScene) -> float:
 
 
 def shares(scene: ExamScene) -> tuple[list[float], list[float]] | None:
-    """For each power the share of the error that is removed: beside the object, and in the band of the true shadow.
+    """Return for each power the removed share of the error: beside the object, and in the band of the true shadow.
 
-    None where shadows show the sun: its shadows stay as computed.
+    Return None if shadows show the sun, because its shadows stay as computed.
     """
     relit = relight(scene.composite, scene.cameras, sources=[scene.source])
     if relit.estimate is not None and relit.estimate.sun is not None:
@@ -46,7 +48,7 @@ def shares(scene: ExamScene) -> tuple[list[float], list[float]] | None:
     before, band_before = ratio_error(pasted, scene), measure_row(pasted, scene.views)["shadow"]
     everywhere, band = [], []
     for power in POWERS:
-        # the transfer has today's power in its layers
+        # the transfer's layers contain today's power
         factor = power / SHADOW_POWER
         ratio = SceneRatio(relit.shadow, relit.bounce, relit.slope).strengthened(factor)
         depth = factor * relit.catcher_depth

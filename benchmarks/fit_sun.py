@@ -1,9 +1,9 @@
-"""Counts over rendered scenes with known light where shadows show the right sun, for each bar that could decide.
+"""Count over rendered scenes with known light how often shadows show the right sun, for each candidate bar.
 
     python benchmarks/fit_sun.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]
 
-SCENES are folders of scenes as `splatgraft paper exam` renders them; both places of each count. A sun is right where it
-lies within 5 degrees of the disc of a true source that gives a fifth of the irradiance on the surface or more.
+SCENES are folders of scenes that `splatgraft paper exam` rendered; both places of each count. A sun is right if it lies
+within 5 degrees of the disc of a true source. The source must give a fifth of the irradiance on the surface or more.
 """
 
 import math
@@ -30,11 +30,11 @@ _STRONG = 0.2
 
 @dataclass(frozen=True)
 class Judged:
-    """A sun that shadows show, against the true light."""
+    """Comparison of a sun found from shadows with the true light."""
 
     sun: Sun
     off_deg: float
-    """From the disc of the nearest strong source; infinite where there is none."""
+    """Distance to the disc of the nearest strong source, degrees; infinite without one."""
     true_ratio: float
     """Irradiance of all sources within 20 degrees of the sun over that of the rest of the light."""
 
@@ -45,7 +45,7 @@ class Judged:
 
     @property
     def ratio(self) -> float:
-        """As the shadows show it."""
+        """Strength that the shadows show."""
         assert self.sun.ratio is not None
         return float(self.sun.ratio @ LUMINANCE)
 
@@ -65,7 +65,7 @@ def judge(sun: Sun, truth: Light) -> Judged:
 
 
 def places_of(scene: ExamScene) -> Iterator[tuple[str, Gaussians, Cameras, BoundingSphere, Light]]:
-    """Of both places: end of the name, all that casts shadows, the cameras, the place, the true light."""
+    """Yield for both places: suffix of the name, all occluders, the cameras, the place, the true light."""
     placed, source = scene.composite.objects[0], scene.source
     yield "", scene.composite.target, scene.cameras, bounding_sphere(placed.in_target()), scene.new_light
     whole = concatenate([source.gaussians, placed.gaussians])

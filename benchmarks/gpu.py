@@ -1,9 +1,9 @@
-"""Everything to measure on a machine with one CUDA card and no network: `python benchmarks/gpu.py --out DIR`.
+"""Measure everything on a machine with one CUDA card and no network: `python benchmarks/gpu.py --out DIR`.
 
-Parts run one after the other, each in a process of its own that is stopped after ten minutes (`--limit`). A finished
-part is not run again: the same command continues after a stop. DIR/gpu.json and DIR/gpu.md hold all results with
-the card's name, after each part; DIR/NAME.log what a part that failed printed. `--toy` runs the same code at toy size
-on the CPU; its figures mean nothing.
+Each part runs in a process of its own, which is stopped after ten minutes (`--limit`). A finished part is not run
+again, so the same command continues after a stop. DIR/gpu.json and DIR/gpu.md hold all results with the card's name,
+after each part. DIR/NAME.log holds the output of a failed part. `--toy` runs the same code at toy size on the CPU; its
+figures mean nothing.
 
     cuda-tests    tests/rendering/test_cuda.py
     renderer      gsplat against the CPU rasteriser: pictures, gradients, W and its transpose; milliseconds
@@ -37,7 +37,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Setting:
-    """What a part is run with."""
+    """Arguments of a part."""
 
     device: torch.device
     toy: bool
@@ -46,7 +46,7 @@ class Setting:
 
     @property
     def repeats(self) -> int:
-        """Timed runs of which the median counts."""
+        """Number of timed runs; their median counts."""
         return 1 if self.toy else 5
 
     def synchronize(self) -> None:
@@ -55,12 +55,12 @@ class Setting:
             torch.cuda.synchronize(self.device)
 
     def peak_gb(self) -> float:
-        """Memory of the card since the part's begin, GB; 0 on the CPU."""
+        """Return the card's peak memory since the part began, GB; 0 on the CPU."""
         return torch.cuda.max_memory_allocated(self.device) / 1e9 if self.device.type == "cuda" else 0.0
 
 
 def cuda_tests(setting: Setting) -> list[Row]:
-    """The renderer's tests that need a card, counted by their result."""
+    """Run the renderer's tests that need a card, and count them by result."""
     command = [
         sys.executable,
         "-m",
@@ -80,7 +80,7 @@ def cuda_tests(setting: Setting) -> list[Row]:
 
 
 def renderer(setting: Setting) -> list[Row]:
-    """Differences of the two rasterisers, and the card's milliseconds."""
+    """Measure the differences of the two rasterisers, and the card's milliseconds."""
     from relight import courtyard
 
     from splatgraft.core.cameras import look_at, pinhole
@@ -120,7 +120,7 @@ def renderer(setting: Setting) -> list[Row]:
 
 
 def reconstruct_captures(setting: Setting) -> list[Row]:
-    """Quality and time of reconstructions: a draft, and `full` (a million Gaussians) with 7000 steps."""
+    """Measure quality and time of reconstructions: a draft, and `full` (a million Gaussians) with 7000 steps."""
     from splatgraft.core.image_metrics import psnr
     from splatgraft.core.posed_images import held_out
     from splatgraft.formats import read_capture
@@ -157,7 +157,7 @@ def reconstruct_captures(setting: Setting) -> list[Row]:
 
 
 def paper_size(setting: Setting) -> list[Row]:
-    """The paper's work after reconstruction; on a card at its size with 300,000 and 1,000,000 Gaussians."""
+    """Measure the paper's work after reconstruction; on a card at its size with 300,000 and 1,000,000 Gaussians."""
     from paper_size import Size, measure
 
     if setting.toy:
@@ -176,7 +176,7 @@ def paper_size(setting: Setting) -> list[Row]:
 
 
 def paper_adam(setting: Setting) -> list[Row]:
-    """The paper's consolidation (its section 6): the time of a step, and of 10,000."""
+    """Measure the paper's consolidation (its section 6): the time of a step, and of 10,000."""
     from paper_size import Size, scene_of
 
     from splatgraft.consolidation import ConsolidateOptions, consolidate
@@ -207,7 +207,7 @@ def paper_adam(setting: Setting) -> list[Row]:
 
 
 def harmonize_plain(setting: Setting) -> list[Row]:
-    """Stock diffusers, then ours with the modulations in a table."""
+    """Measure stock diffusers, then our code with the modulations in a table."""
     from splatgraft.harmonization.flux.baked_modulation import bake
     from splatgraft.harmonization.flux.sampling import schnell_levels
 
@@ -218,14 +218,14 @@ def harmonize_plain(setting: Setting) -> list[Row]:
 
 
 def harmonize_fp8(setting: Setting) -> list[Row]:
-    """Weights stored in 8 bits and cast layer by layer, as `--precision fp8`."""
+    """Measure weights stored in 8 bits and cast layer by layer, as `--precision fp8` does."""
     network, size = _network(setting)
     network.transformer.enable_layerwise_casting(storage_dtype=torch.float8_e4m3fn, compute_dtype=network.dtype)
     return [{"kind": "fp8 stored", **_harmonize_times(network, size, setting), "peak_gb": setting.peak_gb()}]
 
 
 def lora_step(setting: Setting) -> list[Row]:
-    """Seconds of forward, backward and Adam on a low-rank adaptation, frozen weights in bf16."""
+    """Measure seconds of forward, backward and Adam on a low-rank adaptation, with frozen weights in bf16."""
     from splatgraft.harmonization.flux.network import velocity
     from splatgraft_paper.training.flux import add_lora
 
@@ -292,7 +292,7 @@ def _random_network(kind: Any, settings: dict[str, Any], device: torch.device, d
 
 
 def _network(setting: Setting) -> tuple[Any, tuple[int, int]]:
-    """The harmoniser with random weights, of the real size or tiny, and the size of its images."""
+    """Return the harmoniser with random weights, of the real size or tiny, and the size of its images."""
     from splatgraft.harmonization.flux.loading import diffusers_library
     from splatgraft.harmonization.flux.network import Autoencoder, FluxNetwork
     from splatgraft.harmonization.flux.prompt import PromptEmbedding
@@ -314,7 +314,7 @@ def _relative(wanted: torch.Tensor, found: torch.Tensor) -> float:
 
 
 def _median(work: Callable[[], object], setting: Setting) -> float:
-    """Median seconds of `work` after two warm-up runs."""
+    """Return median seconds of `work` after two warm-up runs."""
     times = []
     for i in range(setting.repeats + 2):
         begin = time.perf_counter()
@@ -326,7 +326,7 @@ def _median(work: Callable[[], object], setting: Setting) -> float:
 
 
 def _harmonize_times(network: Any, size: tuple[int, int], setting: Setting) -> Row:
-    """Seconds of encoding, the four sampling steps, decoding, and the whole harmonisation of a view."""
+    """Measure seconds of encoding, the four sampling steps, decoding, and the whole harmonisation of a view."""
     from splatgraft.harmonization import HarmonizerInputs
     from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer
     from splatgraft.harmonization.flux.network import pad_by_reflection, velocity
@@ -363,7 +363,7 @@ def run_part(name: str, setting: Setting, out: Path) -> None:
 
 
 def is_finished(path: Path, *, toy: bool) -> bool:
-    """Whether a part's file holds a result of the same size."""
+    """Return whether a part's file holds a result of the same size."""
     return path.is_file() and json.loads(path.read_text()).get("toy") == toy
 
 

@@ -1,7 +1,8 @@
-"""Lifting masks to Gaussians: the closed form against 10K iterations of binary cross-entropy, on held-out views.
+"""Compare the closed form of lifting masks with 10K iterations of binary cross-entropy, on held-out views.
 
-Every 8th view of the capture is held out of reconstruction and lifting. The object is what each feature selects at the
-same threshold; its picture in a held-out view (where most of the blend is object) is compared with the true mask.
+Every 8th view of the capture is held out of reconstruction and lifting. Both features select the object at the same
+threshold. The pixels of the object in a held-out view are those with an object weight above one half. They are compared
+with the true mask.
 """
 
 import time
@@ -30,11 +31,11 @@ class Lift:
     capture: Path = REPOSITORY / "data" / "vase"
     """A capture with true masks."""
     iterations: int = 10_000
-    """Of the cross-entropy training."""
+    """Number of iterations of the cross-entropy training."""
     cache: Path = REPOSITORY / "build" / "benchmarks"
-    """Where the reconstructed scene is kept between runs."""
+    """Folder that keeps the reconstructed scene between runs."""
     reconstruct_iterations: int = 2000
-    """Of the scene that is lifted to."""
+    """Number of iterations of the reconstruction."""
 
 
 def main(options: Lift) -> None:

@@ -1,16 +1,16 @@
-"""Lift, relight, render, consolidate: the paper's work after reconstruction, at a size given on the command line.
+"""Measure the paper's work after reconstruction at a given size: lift, relight, render, consolidate.
 
-`python benchmarks/paper_size.py --views 200 --size 704x496 --gaussians 300000` is the paper's size (its Table 4 and the
-costs under it: 40 s for features, 3 to 15.5 minutes for consolidating on an H100). The scene is synthetic with a fixed
-seed: a courtyard with a ball of a sixth of the Gaussians on it. The same command runs on CUDA where there is a card.
+`python benchmarks/paper_size.py --views 200 --size 704x496 --gaussians 300000` is the paper's size. Its Table 4 and the
+costs under it: 40 s for features, 3 to 15.5 minutes for consolidating on an H100. The scene is synthetic with a fixed
+seed: a courtyard with a ball on it, which has a sixth of the Gaussians. The same command uses CUDA if there is a card.
 One line per part, and a last line of JSON:
 
     part=lift seconds=.. cpu_seconds=.. peak_mb=..
 
-Masks are the ball's own coverage; the images that are consolidated are the relit renders with a smooth error of
-brightness and colour for each view, as an image model makes. relight splits the Gaussians that the edge of the shadow
-crosses: `gaussians_relit` of the last line are those that render and consolidate work on. At toy sizes, whose floor is
-made of few wide Gaussians, they are many times as many as were asked for.
+Masks are the ball's own coverage. The consolidated images are the relit renders with a smooth error of brightness and
+colour for each view, like an image model's. relight splits the Gaussians that the edge of the shadow crosses. render
+and consolidate therefore work on the `gaussians_relit` of the last line. At toy sizes the floor has few wide Gaussians,
+so this number is many times the given one.
 """
 
 import argparse
@@ -47,7 +47,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Size:
-    """How much work."""
+    """Size of the work."""
 
     views: int = 24
     width: int = 352
@@ -55,7 +55,7 @@ class Size:
     gaussians: int = 30_000
     device: str = "cpu"
     passes: int = 12
-    """Of the descent of `consolidate` over all views."""
+    """Number of passes of `consolidate`'s descent over all views."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +64,17 @@ class Part:
 
     part: str
     seconds: float
-    """Wall clock."""
+    """Wall time."""
     cpu_seconds: float
     peak_mb: float
-    """Resident memory, or the card's where there is one."""
+    """Peak resident memory, or the card's if there is one."""
 
 
 def scene_of(size: Size) -> tuple[Composite, Cameras, Light]:
-    """The composite, its cameras and the light at the object's place; the same for the same size."""
+    """Return the composite, its cameras and the light at the object's place; deterministic in the size."""
     count = size.gaussians // 6
     around = even_directions(count)
-    # as wide as their distance on the ball, so that it is closed at every number
+    # as wide as their distance on the ball, so that the ball is closed at every number
     width = 0.4 * math.sqrt(4 * math.pi / count)
     ball = surfels(0.4 * around + torch.tensor([0.0, 0.0, 0.4]), around, width, 0.6).with_sh_degree(3)
     floor = courtyard(size.gaussians - count).with_sh_degree(3)
@@ -89,14 +89,14 @@ def scene_of(size: Size) -> tuple[Composite, Cameras, Light]:
 
 
 def spoilt(image: Tensor, view: int) -> Tensor:
-    """The image with a brightness that runs across it and a tint of its own, as an image model's single views have."""
+    """Return the image with a gradient of brightness and a tint of its own, like an image model's single views."""
     generator = torch.Generator().manual_seed(view)
     gain = 1 + 0.1 * torch.randn(3, generator=generator) + 0.1 * torch.linspace(-1, 1, image.shape[1])[:, None]
     return (image * gain.to(image)).clamp(0, 1)
 
 
 def measure(size: Size, say: Callable[[str], None] = print) -> dict[str, object]:
-    """Run all parts; returns what the last line has."""
+    """Run all parts and return the fields of the last line."""
     device = torch.device(size.device)
     composite, cameras, light = scene_of(size)
     parts: list[Part] = []

@@ -1,7 +1,7 @@
-"""Time of the CPU rasteriser on random 2D splats, with one thread.
+"""Measure the time of the CPU rasteriser on random 2D splats, with one thread.
 
-Forward is blending, backward the gradients of every splat's centre, shape, opacity and colour, both in CPU time with
-tile lists given; sorting and listing are measured separately.
+Forward is blending; backward gives the gradients of every splat's centre, shape, opacity and colour. Both are CPU times
+with given tile lists. Sorting and listing are measured separately.
 """
 
 import time
@@ -29,7 +29,7 @@ class Splats:
 
 
 def random_splats(seed: int = 0) -> Splats:
-    """Uniform centres, opacities and depths; log-normal axes, any direction."""
+    """Return random splats: uniform centres, opacities and depths; log-normal axes, any direction."""
     rng = np.random.default_rng(seed)
     means = rng.random((COUNT, 2)) * [WIDTH, HEIGHT]
     axes = np.exp(rng.normal(0, 0.6, (COUNT, 2))) * SCALE_PX
@@ -52,7 +52,7 @@ def median_ms(function: Callable[[], object]) -> float:
 
 
 def kernel_splats(splats: Splats) -> np.ndarray:
-    """The rows that `cpu_project.project` would give."""
+    """Return the rows that `cpu_project.project` would give."""
     a, b, c = splats.conics.T
     limit = np.maximum(2 * np.log(np.maximum(splats.opacities, 1e-12) / cpu_project.MIN_ALPHA), 0)
     determinant = a * c - b * b

@@ -1,7 +1,7 @@
-"""Time of a light transfer into targets of 100,000 to 1,000,000 Gaussians, of an object of 50,000.
+"""Measure the time of a light transfer of an object of 50,000 Gaussians into targets of 100,000 to 1,000,000.
 
-`python benchmarks/relight.py`. A synthetic courtyard; prints the first transfer with its estimates of both lights, and
-what a move of the object costs then. `--cpu` counts CPU seconds, which on a machine with other work say more.
+`python benchmarks/relight.py`. The scene is a synthetic courtyard. Printed are the first transfer, with its estimates
+of both lights, and the cost of a later move of the object. `--cpu` counts CPU seconds, for machines with other work.
 """
 
 import argparse
@@ -52,17 +52,17 @@ class Times:
     """Seconds."""
 
     first: float
-    """The first transfer of a composite, with the lights of both places estimated."""
+    """First transfer of a composite, with the lights of both places estimated."""
     given: float
-    """The same with the new light given."""
+    """First transfer of a composite, with the new light given."""
     move: float
-    """After a move of the object under a known light, fitted to the views: what is written to a file."""
+    """Transfer after a move under a known light, fitted to the views, as a file holds it."""
     draft: float
-    """After a move as the editor shows it while one drags: not fitted to the views."""
+    """Transfer after a move, not fitted to the views, as the editor shows it during a drag."""
 
 
 def measure(count: int, *, repeats: int, clock: Callable[[], float] = time.perf_counter) -> Times:
-    """The best of some runs on a target of `count` Gaussians."""
+    """Return the best of some runs on a target of `count` Gaussians."""
     scene = courtyard(count)
     around = even_directions(OCCLUDERS)
     ball = surfels(0.4 * around + torch.tensor([0.0, 0.0, 0.45]), around, 0.006, 0.6)

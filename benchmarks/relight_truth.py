@@ -1,9 +1,9 @@
-"""Error of shadows of a ball and a box on a plane: the transfer's picture against ray casting.
+"""Measure the error of shadows of a ball and a box on a plane: the transfer's picture against ray casting.
 
 `python benchmarks/relight_truth.py [--pictures FOLDER]`. The light is given: a sun of half a degree, round lights of 10
-and 30 degrees, an even sky. The plane is made of small, middle or large Gaussians; those wider than an edge are split
-by the transfer, which is measured beside a transfer that may not split. Errors are of the ratio of linear light after
-to before, per pixel, where the truth is below 0.95 and the object is not.
+and 30 degrees, an even sky. The plane consists of small, middle or large Gaussians. The transfer splits those that are
+wider than an edge; it is also measured without splitting. Errors are of the ratio of linear light after to before, over
+pixels beside the object whose true ratio is below 0.95.
 """
 
 import argparse
@@ -37,31 +37,31 @@ VIEW = 7
 
 @dataclass(frozen=True)
 class Ball:
-    """Standing on the plane z = 0."""
+    """Ball on the plane z = 0."""
 
     radius: float = 0.3
 
     def blocks(self, origin: Float[Tensor, "... 3"], direction: Float[Tensor, "... 3"]) -> Bool[Tensor, "..."]:
-        """Whether rays hit it."""
+        """Return whether rays hit the ball."""
         away = torch.tensor([0.0, 0.0, self.radius]) - origin
         along = (away * direction).sum(-1)
         return (along > 0) & ((away**2).sum(-1) - along**2 < self.radius**2)
 
     def gaussians(self) -> Gaussians:
-        """Black, so that nothing bounces."""
+        """Return black Gaussians, which bounce no light."""
         around, width = even_directions(40000), self.radius / 110
-        # its silhouette at half alpha is 0.5% wider than the true one
+        # the silhouette at half alpha is 0.5% wider than the true one
         return surfels(self.radius * around + torch.tensor([0.0, 0.0, self.radius]), around, width)
 
 
 @dataclass(frozen=True)
 class Box:
-    """Standing on the plane, turned, taller than wide."""
+    """Turned box on the plane, taller than wide."""
 
     half: tuple[float, float, float] = (0.2, 0.14, 0.3)
 
     def blocks(self, origin: Float[Tensor, "... 3"], direction: Float[Tensor, "... 3"]) -> Bool[Tensor, "..."]:
-        """Whether rays hit it."""
+        """Return whether rays hit the box."""
         half = torch.tensor(self.half)
         start = (origin - torch.tensor([0.0, 0.0, self.half[2]])) @ self._turn()
         step = direction @ self._turn()
@@ -71,7 +71,7 @@ class Box:
         return (leaves > enters) & (leaves > 0)
 
     def gaussians(self) -> Gaussians:
-        """Black, so that nothing bounces."""
+        """Return black Gaussians, which bounce no light."""
         gap, half = 0.004, torch.tensor(self.half)
         points, normals = [], []
         for axis in range(3):
@@ -105,7 +105,7 @@ def surfels(points: Tensor, normals: Tensor, width: float, gray: float = 0.0) ->
 
 
 def plane(width: float) -> Gaussians:
-    """Gaussians of standard deviation `width`, one and a half of that apart: nowhere does the ground show through."""
+    """Return Gaussians of standard deviation `width`, 1.5 `width` apart, so that no ground shows through."""
     generator = torch.Generator().manual_seed(0)
     x = torch.arange(-2.4, 2.4, 1.5 * width)
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
@@ -118,14 +118,14 @@ def plane(width: float) -> Gaussians:
 
 
 def disk(direction: Tensor, radius_deg: float, count: int) -> Float[Tensor, "n 3"]:
-    """Directions spread evenly over the solid angle of a round light."""
+    """Return directions spread evenly over the solid angle of a round light."""
     i = torch.arange(count) + 0.5
     cosine = 1 - i / count * (1 - math.cos(math.radians(radius_deg)))
     return vogel_offsets(direction, (1 - cosine**2).sqrt(), i) + cosine[:, None] * direction
 
 
 def true_ratio(shape: Ball | Box, light: Light, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
-    """Irradiance on the plane with the object over that without, by rays."""
+    """Return irradiance on the plane with the object over irradiance without it, by ray casting."""
     hemisphere = even_directions(8192)
     hemisphere = hemisphere[hemisphere[:, 2] > 0]
     sky = float(light.ambient_radiance(hemisphere[:1])[0, 0]) * 2 * math.pi / len(hemisphere)
@@ -166,7 +166,7 @@ def views() -> Cameras:
 
 
 def on_plane(camera: Cameras) -> Float[Tensor, "m 3"]:
-    """Where the ray of each pixel meets z = 0."""
+    """Return the intersection of each pixel's ray with z = 0."""
     width, height = camera.sizes[0].tolist()
     v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     k, pose = camera.intrinsics[0], camera.world_from_camera[0]
@@ -184,12 +184,12 @@ class Measured:
 
     @property
     def rmse(self) -> float:
-        """Root mean square error over the band."""
+        """Return the root mean square error over the band."""
         return float(((self.truth - self.found)[self.band] ** 2).mean().sqrt())
 
 
 def measure(shape: Ball | Box, light: Light, truth: Float[Tensor, "h w"], *, width: float, split: bool) -> Measured:
-    """The transfer's shadow on a plane of Gaussians `width` wide, in one view, beside the truth."""
+    """Return the transfer's shadow on a plane of Gaussians `width` wide, in one view, with the truth."""
     scene, thing, cameras = plane(width), shape.gaussians(), views()
     nothing_erased = torch.zeros(scene.count, dtype=torch.bool)
     composite = Composite(scene, (PlacedObject(thing, Similarity(1.0, torch.eye(3), torch.zeros(3))),), nothing_erased)
@@ -207,7 +207,7 @@ def measure(shape: Ball | Box, light: Light, truth: Float[Tensor, "h w"], *, wid
 
 
 def picture(one: Measured) -> Float[Tensor, "h w"]:
-    """Truth, what was found, and three times the difference around grey."""
+    """Return truth, transfer, and three times their difference around grey, side by side."""
     difference = (0.5 + 3 * (one.found - one.truth) * one.band).clamp(0, 1)
     return torch.cat([one.truth.clamp(0, 1), one.found.clamp(0, 1), difference], 1)
 

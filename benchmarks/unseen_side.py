@@ -1,10 +1,10 @@
-"""Half of an object's photographs left out: how it looks from there, with its unseen side open and closed.
+"""Measure an object from its unseen side, open and closed, after half of its photographs were left out.
 
     python benchmarks/unseen_side.py CAPTURE [CAPTURE ...] [--pictures FOLDER]
 
-CAPTURE has poses and masks all around the object. The photographs of a half circle are left out; the rest is
-reconstructed and the object is cut. Printed is the PSNR over black inside the true mask, widened by two pixels, in
-the photographs that were left out and in the others.
+CAPTURE has poses and masks all around the object. The photographs of a half circle are left out. The others are
+reconstructed and the object is cut. Printed is the PSNR over black inside the true mask, widened by two pixels, in the
+photographs that were left out and in the others.
 """
 
 import argparse
@@ -31,9 +31,9 @@ _MARGIN_PX = 2
 
 
 def halves(capture: PosedImages) -> tuple[PosedImages, Int[Tensor, "a"], Int[Tensor, "b"]]:
-    """The capture from one half circle around what the cameras look at, its photographs, and the others.
+    """Return the capture from one half circle around the subject, its photographs, and the other photographs.
 
-    Points on the other side go, too: the photographs that are left do not show them.
+    Points on the other side are removed too, because the remaining photographs do not show them.
     """
     tangent, bitangent = tangents(estimate_up(capture.cameras))
     focus = focus_point(capture.cameras)
@@ -50,14 +50,14 @@ def halves(capture: PosedImages) -> tuple[PosedImages, Int[Tensor, "a"], Int[Ten
 
 
 def on_black(capture: PosedImages, index: int) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """A photograph's object over black, and its mask."""
+    """Return a photograph's object over black, and its mask."""
     mask = capture.mask(index)
     assert mask is not None
     return capture.image(index) * mask[..., None], mask
 
 
 def mean_psnr(object_: Gaussians, capture: PosedImages, which: Int[Tensor, "n"]) -> float:
-    """Over some photographs, inside the widened mask."""
+    """Return the PSNR over some photographs, inside the widened mask."""
     found = []
     for index in which.tolist():
         truth, mask = on_black(capture, index)
@@ -68,7 +68,7 @@ def mean_psnr(object_: Gaussians, capture: PosedImages, which: Int[Tensor, "n"])
 
 
 def measure(path: Path, pictures: Path | None) -> tuple[float, ...]:
-    """The share that is guessed, then PSNR open and closed in the photographs left out, and in the others."""
+    """Return the guessed share, then PSNR open and closed in the photographs left out, and in the others."""
     capture = read_capture(path)
     part, kept, left_out = halves(capture)
     found = segment(reconstruct(part, OPTIONS), part)

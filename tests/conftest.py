@@ -1,11 +1,11 @@
-"""One thread a worker, Hypothesis without limits of time, and one finished project that tests copy.
+"""One thread a worker, Hypothesis without time limits, and one finished project that tests copy.
 
 No test may fail because the machine is slow or busy: time limits (pyproject.toml) are there against hangs alone.
 """
 
 import os
 
-# before torch and numba are imported, which read them then; two workers share two cores
+# before torch and numba are imported, because they read these then; two workers share two cores
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = os.environ["NUMBA_NUM_THREADS"] = "1"
 
@@ -24,19 +24,19 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 
-_THREAD_SECONDS = 60.0  # longest wait for all threads: that of a page which no test closed never ends
+_THREAD_SECONDS = 60.0  # longest wait for all threads, because the thread of a page that no test closed never ends
 
 _STORY_SECONDS = 600
-"""Seconds after which a test in a browser is taken for a hang; pytest-timeout then shows what each thread does."""
+"""Seconds after which a browser test counts as hanging; pytest-timeout then shows what each thread does."""
 
 
 _LONGEST = ("test_page_in_browser.py", "test_examples.py", "test_try.py", "test_exported_page.py")
-"""Modules that go first, so that no worker is alone with one of them at the end."""
+"""Modules that run first, so that no worker is alone with one of them at the end."""
 
 
 @pytest.fixture(scope="session")
 def finished_project(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of tiny_project.py's project with the results of all steps, made once for all workers.
+    """Make the folder of tiny_project.py's project with the results of all steps, once for all workers.
 
     Read it, never write into it: `copy_project` gives a copy. Beside it, in `../photos/source` and `../photos/target`,
     are the captures that its project.toml names.
@@ -57,14 +57,14 @@ def finished_project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module", autouse=True)
 def _no_open_files() -> Iterator[None]:
-    """Collect garbage behind each module, so that a file left open fails there for certain and not later by chance."""
+    """Collect garbage after each module, so that a file left open fails there and not later by chance."""
     yield
     gc.collect()
 
 
 @pytest.fixture
 def copy_project(finished_project: Path, tmp_path: Path) -> Callable[[], Path]:
-    """A function that copies `finished_project` with its captures into `tmp_path` and gives the copy's folder.
+    """Return a function that copies `finished_project` with its captures into `tmp_path` and returns the copy's folder.
 
     Every step of the copy is up to date. For a copy that a module's tests share, call `copy_of` of tiny_project.py in a
     fixture of the module: `copy_of(finished_project, tmp_path_factory.mktemp("shared"))`.
@@ -75,7 +75,7 @@ def copy_project(finished_project: Path, tmp_path: Path) -> Callable[[], Path]:
 
 
 def pytest_sessionfinish() -> None:
-    """Wait for the editor's threads, since Python aborts where one of them is in torch when it ends."""
+    """Wait for the editor's threads, because Python aborts if one of them is in torch at the end."""
     end = time.monotonic() + _THREAD_SECONDS
     for thread in threading.enumerate():
         if thread.name.startswith("splatgraft"):
@@ -83,7 +83,7 @@ def pytest_sessionfinish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest modules first, mark the tests that use a browser, and end one that hangs in a call of its own."""
+    """Put the longest modules first, mark the tests that use a browser, and end browser tests that hang."""
     # `.ci/run` tells xdist to keep the order
     items.sort(key=lambda item: _LONGEST.index(item.path.name) if item.path.name in _LONGEST else len(_LONGEST))
     for item in items:

@@ -1,4 +1,4 @@
-"""A kill in the process: from its n-th write on, nothing reaches the disk any more, clean-up included."""
+"""Simulate a kill in the process: from the n-th write on, no write reaches the disk, clean-up included."""
 
 import os
 import sys
@@ -9,12 +9,12 @@ _CHANGES = ("os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.link", "os.tru
 
 
 class Killed(BaseException):
-    """Raised by every write after the fatal one."""
+    """Error of every write after the fatal one."""
 
 
 class _State:
     writes_left: int | None = None
-    """None while nothing is to be killed."""
+    """Number of writes left, None outside of a test."""
 
 
 def _count(event: str, arguments: tuple) -> None:
@@ -26,7 +26,7 @@ def _count(event: str, arguments: tuple) -> None:
             raise Killed
 
 
-# an audit hook stays for good; it does nothing outside of the block below
+# an audit hook cannot be removed; it has no effect outside of the block below
 sys.addaudithook(_count)
 
 

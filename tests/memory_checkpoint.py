@@ -1,4 +1,4 @@
-"""A checkpoint in memory, and the error by which tests interrupt what saves to it."""
+"""A checkpoint in memory, and the error by which tests interrupt the code that saves to it."""
 
 from typing import Any
 
@@ -6,18 +6,18 @@ import torch
 
 
 class KilledError(Exception):
-    """Raised by a test where a process would be killed."""
+    """Error that a test raises in place of a kill."""
 
 
 class MemoryCheckpoint:
-    """A `Checkpoint` that holds a copy of the last state."""
+    """`Checkpoint` that holds a copy of the last state."""
 
     def __init__(self) -> None:
-        """Nothing saved."""
+        """Begin without a state."""
         self.state: Any = None
 
     def load(self) -> dict[str, Any] | None:
-        """The last state."""
+        """Return the last state."""
         return self.state
 
     def save(self, state: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Generated captures of an object on a table, with the true masks and a scene as a reconstruction would give it.
+"""Generated captures of an object on a table, with the true masks and a scene like a reconstruction of it.
 
 Each `kind` is one way in which colour alone misleads: `plain` (it does not), `like_the_table` (the object has the
 colour of the wooden table), `two_parts` (a dark pot below green leaves, on a dark cloth), `crowded` (others stand
@@ -30,11 +30,11 @@ class ObjectCapture:
     images: list[Tensor]
     """sRGB, (h, w, 3)."""
     masks: list[Tensor]
-    """1 where the object shows, (h, w)."""
+    """1 on the object, (h, w)."""
     scene: Gaussians
-    """Displaced at random, as after a short reconstruction, and with floaters."""
+    """Gaussians displaced at random, as after a short reconstruction, and with floaters."""
     is_object: Tensor
-    """Which of the Gaussians are the object's."""
+    """Whether each Gaussian is the object's."""
 
 
 def object_capture(kind: str, *, views: int = 12, size: tuple[int, int] = (160, 120), seed: int = 0) -> ObjectCapture:
@@ -118,7 +118,7 @@ def _surroundings(kind: str, generator: torch.Generator) -> Gaussians:
 
 
 def sheet(center, u, v, *, srgb, generator: torch.Generator, width: float = 0.02) -> Gaussians:
-    """A textured parallelogram center +- u +- v."""
+    """Return a textured parallelogram center +- u +- v."""
     middle, u, v = (torch.tensor(x, dtype=torch.float32) for x in (center, u, v))
     rows, columns = (max(2, math.ceil(2 * float(x.norm()) / width / 1.2)) for x in (u, v))
     a, b = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
@@ -150,13 +150,13 @@ def cylinder(foot, *, radius: float, height: float, srgb, generator: torch.Gener
 
 
 def _textured(points: Tensor, normals: Tensor, srgb, *, width: float, generator: torch.Generator) -> Gaussians:
-    """Surfels whose colours vary from spot to spot by a tenth, as wood and cloth do."""
+    """Return surfels with colours that vary from spot to spot by a tenth, like wood and cloth."""
     shade = 1 + 0.1 * torch.randn(len(points), 1, generator=generator)
     colors = (torch.tensor(srgb) * shade).clamp(0, 1)
     return replace(surfels(points, normals, width=width), sh=dc_from_rgb(colors)[:, None])
 
 
 def iou(a: Tensor, b: Tensor) -> float:
-    """Intersection over union of two masks; 1 where both are empty."""
+    """Return the intersection over union of two masks; 1 if both are empty."""
     either = ((a > 0.5) | (b > 0.5)).sum()
     return float(((a > 0.5) & (b > 0.5)).sum() / either) if either else 1.0

@@ -1,4 +1,4 @@
-"""Files in the layout of LPIPS's published weights, with random numbers."""
+"""Random weights in the file layout of LPIPS's published ones."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Flat Gaussians on surfaces whose geometry is known, and cameras around them; for tests in closed form."""
+"""Flat Gaussians on surfaces of known geometry, and cameras around them, for tests in closed form."""
 
 import math
 
@@ -23,7 +23,7 @@ def surfels(
     srgb: Tensor | tuple[float, float, float] | float = 0.5,
     thickness: float | None = None,
 ) -> Gaussians:
-    """Discs of standard deviation `width` at `points (n, 3)`; `srgb` is one gray, one colour or one per point."""
+    """Return discs of standard deviation `width` at `points (n, 3)`; `srgb` is a gray, a colour or one per point."""
     n = len(points)
     thickness = 0.1 * width if thickness is None else thickness
     return Gaussians(
@@ -44,7 +44,7 @@ def ring(
     focal: float = 100.0,
     size: tuple[int, int] = (128, 96),
 ) -> Cameras:
-    """Cameras on a circle `height` above `center`, looking at it."""
+    """Return cameras on a circle `height` above `center`, looking at it."""
     turn = torch.arange(count) / count * 2 * math.pi
     middle = torch.tensor(center)
     eyes = middle + torch.stack([radius * turn.cos(), radius * turn.sin(), torch.full((count,), height)], 1)
@@ -52,7 +52,7 @@ def ring(
 
 
 def random_scene(n: int, degree: int, seed: int) -> Gaussians:
-    """Gaussians of a tenth of a unit within a few units of the origin."""
+    """Return Gaussians of a tenth of a unit within a few units of the origin."""
     generator = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -68,13 +68,13 @@ def random_scene(n: int, degree: int, seed: int) -> Gaussians:
 
 
 def camera_inside(width: int = 37, height: int = 29) -> Cameras:
-    """A camera in `random_scene`, some Gaussians behind it; sizes that no tile divides."""
+    """Return a camera in `random_scene`, some Gaussians behind it, in sizes that no tile divides."""
     pose = look_at(torch.tensor([[0.5, 0.3, -2.2]]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
     return pinhole(pose, 40.0, width=width, height=height)
 
 
 def sunlit_scene(sun: Tensor, strength: float) -> Gaussians:
-    """Balls on a floor of one material, lit by `sun` and an even sky; both of their shadows are exact."""
+    """Return balls on a floor of one material, lit by `sun` and an even sky; both of their shadows are exact."""
     generator = torch.Generator().manual_seed(1)
     centers = torch.tensor([[1.0, 0.2, 0.25], [-0.6, 0.9, 0.25], [-0.7, -0.8, 0.25], [0.5, -1.1, 0.25]])
     grid = (torch.rand(12000, 2, generator=generator) - 0.5) * 5
@@ -91,7 +91,7 @@ def sunlit_scene(sun: Tensor, strength: float) -> Gaussians:
         along = away @ sun
         hit = (along > 0) & ((away**2).sum(1) - along**2 < 0.25**2)
         lit = torch.where(hit & ((point - center).norm(dim=1) > 0.26), 0, lit)
-    # of a floor's sky a ball takes its form factor
+    # a ball takes its form factor of the floor's sky
     distance = (point[:, None] - centers).norm(dim=-1)
     sky = torch.where(point[:, 2] > 0, 1, 1 - (0.25**3 / distance**3).sum(1))
     gray = 0.15 * (sky + strength * lit)

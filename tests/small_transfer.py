@@ -1,4 +1,4 @@
-"""A transfer without training: a ball on a plane, in two colours, as the folders of a project hold it."""
+"""A transfer without training: a ball on a plane, in two colours, in the folders of a project."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,14 +13,14 @@ from splatgraft.project.metric_scale import MetricScale, write_scale
 
 
 def darkened(gaussians: Gaussians, factor: float) -> Gaussians:
-    """Colours times `factor`, in sRGB."""
+    """Return colours times `factor`, in sRGB."""
     sh = gaussians.sh * factor
     sh[:, 0] -= (1 - factor) * 0.5 / 0.28209479
     return replace(gaussians, sh=sh)
 
 
 def parts() -> dict[str, Gaussians]:
-    """The place, the object as captured and relit, and the place with a shadow around the middle."""
+    """Return the place, the object as captured and relit, and the place with a shadow around the middle."""
     place, object_ = plane((0.6, 0.6, 0.7)).with_sh_degree(1), ball().with_sh_degree(1)
     near = (place.means[:, :2].norm(dim=1) < 0.45)[:, None, None]
     shadowed = replace(place, sh=torch.where(near, darkened(place, 0.5).sh, place.sh))
@@ -28,7 +28,7 @@ def parts() -> dict[str, Gaussians]:
 
 
 def write_transfer(root: Path, *, metres_per_unit: float | None = 0.5) -> Path:
-    """The folders of a project in which `relight` and `consolidate` have run; gives its root."""
+    """Write the folders of a project after `relight` and `consolidate`, and return its root."""
     photograph(root / "photos", parts()["place"], None)
     project = root / "a_ball_on_a_plane"
     for name in ("target/scene", "composite", "relit", "result"):

@@ -15,7 +15,7 @@ RECORDED = Path(__file__).with_name("api.txt")
 
 
 def signature(function: object) -> str:
-    """Parameters in order, keyword-only ones after `*`, with `=` where there is a default."""
+    """Return the parameters in order, keyword-only ones after `*`, with `=` if there is a default."""
     words: list[str] = []
     for parameter in inspect.signature(function).parameters.values():  # pyright: ignore[reportArgumentType]
         if parameter.kind is parameter.KEYWORD_ONLY and "*" not in words:
@@ -25,7 +25,7 @@ def signature(function: object) -> str:
 
 
 def described(name: str) -> list[str]:
-    """The signature of a function or a class, and the public methods and properties of the class below it."""
+    """Return the signature of a function or a class, and the public methods and properties of the class below it."""
     found = getattr(sg, name)
     if not inspect.isclass(found):
         return [name + signature(found)]

@@ -1,4 +1,4 @@
-"""The command line: one line and exit 2 for what the user can mend, and help that names every command."""
+"""The command line: one line and exit 2 for errors of the user, and help that names every command."""
 
 import importlib
 import tomllib

@@ -1,4 +1,4 @@
-"""The examples run as they are and warn of nothing."""
+"""The examples run unchanged and without warnings."""
 
 import runpy
 from pathlib import Path

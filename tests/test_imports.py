@@ -1,4 +1,4 @@
-"""What is heavy or optional is loaded only by who needs it."""
+"""Heavy and optional modules are loaded only by the code that needs them."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The wheel holds all that the installed package reads: captures of the demo, weights, the report's page."""
+"""The wheel holds all files that the installed package reads: captures of the demo, weights, the report's page."""
 
 import subprocess
 import sys
@@ -14,9 +14,9 @@ pytestmark = pytest.mark.long
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
-    """Names of the files in a wheel that is built from this tree."""
+    """Return the names of the files in a wheel built from this tree."""
     out = tmp_path_factory.mktemp("wheel")
-    # from a copy: a build leaves folders beside the sources
+    # from a copy, because a build leaves folders beside the sources
     tree = out / "tree"
     tracked = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True).stdout
     for name in tracked.decode().rstrip("\0").split("\0"):

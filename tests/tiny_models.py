@@ -55,7 +55,7 @@ def tiny_prompt(seed=2):
 
 
 def flux_folder(folder: Path, in_channels=CHANNELS * 4, variant=None, seed=0) -> Path:
-    """FLUX.1-schnell's layout (transformer/, vae/), tiny; 48 input channels make it a harmoniser."""
+    """Write FLUX.1-schnell's layout (transformer/, vae/), tiny; 48 input channels make it a harmoniser."""
     from splatgraft.harmonization.flux.prompt import write_prompt
 
     tiny_transformer(in_channels, seed).save_pretrained(folder / "transformer")
@@ -67,7 +67,7 @@ def flux_folder(folder: Path, in_channels=CHANNELS * 4, variant=None, seed=0) ->
 
 
 def removal_folder(folder: Path) -> Path:
-    """Stable Diffusion 2's layout (unet/, vae/), tiny."""
+    """Write Stable Diffusion 2's layout (unet/, vae/), tiny."""
     from diffusers import UNet2DConditionModel
 
     from splatgraft.harmonization.flux.tensor_file import write_tensors
@@ -90,7 +90,7 @@ def removal_folder(folder: Path) -> Path:
 
 
 def kontext_folder(folder: Path) -> Path:
-    """A whole FluxKontextPipeline of the classes that diffusers' own tests take, tiny, with a few words."""
+    """Write a whole FluxKontextPipeline of the classes in diffusers' own tests, tiny, with a few words."""
     from diffusers import FlowMatchEulerDiscreteScheduler, FluxKontextPipeline
     from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer, T5Config, T5EncoderModel, T5TokenizerFast
 

@@ -69,7 +69,7 @@ def ball() -> Gaussians:
 def photograph(
     folder: Path, scene: Gaussians, object_: Gaussians | None, around_deg: float = 360.0, *, width: int = 48
 ) -> None:
-    """A capture of `scene` by 8 cameras of 48x36 pixels or larger, with masks of `object_` where there is one."""
+    """Write a capture of `scene` by 8 cameras of 48x36 pixels or larger, with masks of `object_` if it is given."""
     angles = torch.arange(8) * math.radians(around_deg / 8)
     eyes = torch.stack([1.6 * angles.cos(), 1.6 * angles.sin(), torch.full((8,), 1.0)], 1)
     poses = look_at(eyes, torch.tensor([0.0, 0, 0.15]), torch.tensor([0.0, 0, 1]))
@@ -94,7 +94,7 @@ def photograph(
 
 
 def write_project(root: Path, options: str = OPTIONS) -> Path:
-    """Two captures and a project.toml; gives the file."""
+    """Write two captures and a project.toml, and return the file."""
     photograph(root / "photos" / "source", plane((0.3, 0.5, 0.3)), ball())
     photograph(root / "photos" / "target", plane((0.5, 0.45, 0.6)), None)
     path = root / "project" / "project.toml"
@@ -105,26 +105,26 @@ def write_project(root: Path, options: str = OPTIONS) -> Path:
 
 
 def finish_project(root: Path) -> Path:
-    """Two captures and a project with all results; gives its folder."""
+    """Write two captures and a project with all results, and return its folder."""
     path = write_project(root)
     assert main(["run", str(path)]) == 0
     return path.parent
 
 
 def copy_of(project: Path, root: Path) -> Path:
-    """Copy a project and the captures beside it, its steps as up to date as they are; gives its folder in `root`."""
+    """Copy a project and the captures beside it with its steps equally up to date, and return its folder in `root`."""
     for name in ("photos", project.name):
         shutil.copytree(project.parent / name, root / name)
     return root / project.name
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Hashes of all files of a result but step.json, by path."""
+    """Return hashes of all files of a result except step.json, by path."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != "step.json"]
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 if __name__ == "__main__":
-    # compiles most kernels in a fresh clone, which two workers would both do
+    # compiles most kernels in a fresh clone, which otherwise two workers would both do
     with tempfile.TemporaryDirectory() as folder:
         finish_project(Path(folder))

@@ -1,4 +1,4 @@
-"""benchmarks/captures.py on a generated capture: a line for each size of picture, of one reconstruction."""
+"""benchmarks/captures.py on a generated capture: one reconstruction gives a line for each size of picture."""
 
 import os
 import subprocess
@@ -55,10 +55,10 @@ def test_one_reconstruction_is_compared_at_every_size_that_is_asked_for(folder):
     )
     assert (small["longest_px"], large["longest_px"]) == ("48", "96")
     assert (small["capture"], small["quality"], small["views"]) == ("toy", "draft", "2")
-    # one reconstruction: its cost is the same to the second
+    # one reconstruction, so its cost is equal to the second
     assert all(small[name] == large[name] for name in ("seconds", "cpu_seconds", "gaussians", "peak_mb"))
     assert small["psnr"] != large["psnr"]
     assert float(large["psnr"]) > 20
-    # fitted alone, it sticks out of its outline less
+    # after the fit of its own, the object exceeds its outline less
     assert float(fitted["overlap"]) > float(cut["overlap"])
     assert float(fitted["psnr_fit"]) > 25

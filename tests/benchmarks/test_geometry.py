@@ -1,4 +1,4 @@
-"""The errors of benchmarks/geometry.py on a plane whose depth and normal are known, and where points are found."""
+"""Errors of benchmarks/geometry.py on a plane of known depth and normal, and the points that it finds."""
 
 import geometry
 import pytest
@@ -10,13 +10,13 @@ from splatgraft.core.cameras import Cameras, look_at, pinhole
 
 @pytest.fixture
 def camera() -> Cameras:
-    """It looks down at the ground, z = 0, half a radian below the horizon."""
+    """Return a camera that looks down at the ground, z = 0, half a radian below the horizon."""
     eye = torch.tensor([[0.0, -1.76, 0.96]])
     return pinhole(look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 120.0, width=96, height=64)
 
 
 def ground_depth(camera: Cameras, slope: float = 0.0):
-    """Depth of the plane z = slope * y, stored as float16 as the renders are."""
+    """Return the depth of the plane z = slope * y, stored as float16 like the renders."""
     pose = camera.world_from_camera[0]
     normal = torch.tensor([0.0, -slope, 1.0])
     depth = -(pose[:3, 3] @ normal) / (camera.rays() @ pose[:3, :3].T @ normal)

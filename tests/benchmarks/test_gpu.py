@@ -1,4 +1,4 @@
-"""Every part of benchmarks/gpu.py at toy size on the CPU, and that a finished part is not run again."""
+"""Every part of benchmarks/gpu.py runs at toy size on the CPU, and a finished part is not run again."""
 
 import json
 import subprocess
@@ -23,7 +23,7 @@ def test_every_part_runs_at_toy_size(name, tmp_path):
     assert record["rows"]
     assert all(value == value for row in record["rows"] for value in row.values())  # noqa: PLR0124 - no nan
     if name == "paper-size":
-        # the ball's shadow has an edge, and what it crosses is split
+        # the ball's shadow has an edge, and relight splits the Gaussians across it
         assert record["rows"][0]["gaussians_relit"] > record["rows"][0]["gaussians"] == 600
     assert gpu.is_finished(tmp_path / f"{name}.json", toy=True)
     assert not gpu.is_finished(tmp_path / f"{name}.json", toy=False)

@@ -1,4 +1,4 @@
-"""Uses the add-on as a user does, in Blender as a Python module, and writes down what there then is. Runs in Blender.
+"""Drive the add-on in Blender as a Python module like a user, and write down the resulting scene. Runs in Blender.
 
 drive_addon.py ADDON COMMAND PROJECT TARGET FOLDER OUT: FOLDER holds bare.ply, the target's scene alone, and bare.glb.
 """
@@ -25,7 +25,7 @@ def main(addon_file, command, source, target, folder, out):
     settings = bpy.context.scene.splatgraft
     settings.command, settings.folder, settings.source, settings.target = command, folder, source, folder
     found["refused"] = refused("load")
-    # what is known of neither side: a scene and an object without captures
+    # an object and a scene without captures
     settings.source = str(Path(source) / "object" / "object.ply")
     settings.target, settings.folder = str(Path(folder) / "bare.ply"), str(Path(folder) / "bare")
     run(addon, "load")
@@ -36,7 +36,7 @@ def main(addon_file, command, source, target, folder, out):
     root, box, thing = (addon.find(part) for part in ("root", "box", "object"))
     found["target"] = world_points(addon.find("target"))
     found["height"] = float(np.ptp(np.array(world_points(thing))[:, 2]))
-    # a box that is scaled unevenly is refused before anything runs
+    # a box with uneven scale is refused before anything runs
     box.scale = (1.0, 2.0, 1.0)
     found["sheared"] = refused("relight")
     box.location, box.rotation_mode, box.scale = (0.2, -0.1, 0.35), "XYZ", (0.6, 0.6, 0.6)
@@ -84,7 +84,7 @@ def run(addon, name):
 
 
 def finish(addon):
-    """What Blender's timer does, which a module without a window's loop has not."""
+    """Run Blender's timers, because a module without a window has no loop that does."""
     while addon.Job.poll() is not None:
         time.sleep(0.05)
 
@@ -108,7 +108,7 @@ def described(lamp):
 
 
 def render(camera, width, height, samples):
-    """Linear rgb, top row first."""
+    """Return linear rgb, top row first."""
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.device, scene.cycles.samples, scene.camera = "CYCLES", "CPU", samples, camera
     scene.cycles.use_denoising = scene.cycles.use_adaptive_sampling = False
@@ -131,7 +131,7 @@ def new_camera(location, rotation):
 
 
 def render_world():
-    """A panorama of the world alone: top +z, middle +x, to the right -y."""
+    """Render a panorama of the world alone: top +z, middle +x, to the right -y."""
     camera = new_camera((0, 0, 0), (math.pi / 2, 0, -math.pi / 2))
     camera.data.type, camera.data.panorama_type = "PANO", "EQUIRECTANGULAR"
     things = [one for one in bpy.data.objects if one.type in ("MESH", "LIGHT") and not one.hide_render]
@@ -144,7 +144,7 @@ def render_world():
 
 
 def render_level(addon, root, away):
-    """Mean radiance of a white plane that faces a lamp of irradiance (1, .5, .25), at a distance or infinitely far."""
+    """Return mean radiance of a white plane under a lamp of irradiance (1, .5, .25), at a distance or at infinity."""
     for one in bpy.data.objects:
         one.hide_render = True
     bpy.context.scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.0

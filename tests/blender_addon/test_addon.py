@@ -28,12 +28,12 @@ pytestmark = [
 ADDON = Path(__file__).parents[2] / "blender_addon" / "splatgraft_addon.py"
 SUN = torch.nn.functional.normalize(torch.tensor([-0.39, 0.67, 0.8]), dim=0)
 CAPTURE_FROM_WORLD = torch.tensor([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
-"""A capture as structure from motion has it, y down."""
+"""Rotation into the axes of a capture by structure from motion, y down."""
 
 
 @pytest.fixture(scope="module")
 def used(finished_project: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, Path]:
-    """What drive_addon.py found, and the folder of the results."""
+    """Return the findings of drive_addon.py, and the folder of the results."""
     root = tmp_path_factory.mktemp("addon")
     target, folder, out = root / "place" / "target", root / "work", root / "found.json"
     turned = Similarity(1.0, CAPTURE_FROM_WORLD, torch.zeros(3))
@@ -68,10 +68,10 @@ def test_loaded_parts_are_upright_and_said_to_be_points(used, finished_project: 
     assert "Target: expected a scene or a project with target/scene" in found["refused"]
     assert found["loaded"].startswith("coloured points, as neither Blender 5.3 nor the add-on KIRI 3DGS Render is here")
     for name in ("target", "bare"):
-        # the floor, seen from cameras that are known or made, is level and below
+        # the floor is level and below, seen from given or generated cameras
         low = np.percentile(points(found[name])[:, 2], [5, 50])
         assert np.abs(low).max() < 0.01
-    # as large as in its own capture, in which z is up by cameras on a level ring
+    # as large as in its own capture; there z is up, because the cameras are on a level ring
     own = read_gaussians(finished_project / "object" / "object.ply").means[:, 2]
     assert found["height"] == pytest.approx(float(own.max() - own.min()), rel=1e-4)
 
@@ -116,7 +116,7 @@ def test_the_world_is_the_map_turned_as_the_target(used):
     v = (np.arccos(np.clip(z, -1, 1)) / math.pi * len(loaded)).astype(int).clip(0, len(loaded) - 1)
     u = ((0.5 - np.arctan2(y, x) / (2 * math.pi)) * 2 * len(loaded)).astype(int) % (2 * len(loaded))
     expected = loaded[v, u, ::-1]
-    # a rendered pixel is the mean of 16 of the map's, which is smooth but for edges
+    # a rendered pixel is the mean of 16 of the map's pixels, which is smooth except at edges
     assert np.median(np.abs(rendered - expected)) < 0.01 * expected.mean()
     assert rendered.mean() == pytest.approx(expected.mean(), rel=0.02)
 

@@ -1,4 +1,4 @@
-"""Captures of made-up photos: noise with the spectrum of photographs, cameras on a ring."""
+"""Captures of generated photos: noise with the spectrum of photographs, cameras on a ring."""
 
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ SIZE = (160, 120)
 
 
 def texture(seed: int, size: tuple[int, int] = SIZE) -> np.ndarray:
-    """(h, w, 3) bytes of 1/f noise, the spectrum of photographs."""
+    """Return (h, w, 3) bytes of 1/f noise, the spectrum of photographs."""
     width, height = size
     noise = np.random.default_rng(seed).normal(size=(height, width, 3))
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None])
@@ -39,7 +39,7 @@ def write_photos(folder: Path, count: int, suffix: str = ".png") -> list[Path]:
 
 
 def write_posed(folder: Path, count: int = 10, *, masks: bool = False) -> list[Path]:
-    """A capture with transforms.json, and masks/ of discs; gives the photos."""
+    """Write a capture with transforms.json and masks/ of discs, and return the photos."""
     paths = write_photos(folder / "images", count)
     if masks:
         (folder / "masks").mkdir()
@@ -59,7 +59,7 @@ def disc() -> np.ndarray:
 
 
 def colmap_answer(names: list[str], poses: Tensor, size: tuple[int, int], **figures: Any) -> dict[str, Any]:
-    """What the COLMAP process answers: photos of one lens with these poses (n, 4, 4)."""
+    """Return the answer of the COLMAP process: photos of one lens with these poses (n, 4, 4)."""
     width, height = size
     focal = 1.25 * width
     images = [

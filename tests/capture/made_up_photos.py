@@ -1,4 +1,4 @@
-"""Photos whose true poses are known, rendered by plain numpy: a textured box on a turntable before a still wall."""
+"""Photos with known true poses, rendered by plain numpy: a textured box on a turntable before a still wall."""
 
 from pathlib import Path
 
@@ -35,7 +35,7 @@ def texture(generator: np.random.Generator, side: int) -> np.ndarray:
 
 
 def similarity_to(truth: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, float]:
-    """The best similarity transform's rotation (Umeyama 1991), and the largest distance of the points after it."""
+    """Return the rotation of the best similarity (Umeyama 1991), and the largest distance of the points after it."""
     x, y = found - found.mean(0), truth - truth.mean(0)
     u, s, vt = np.linalg.svd(y.T @ x)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
@@ -56,7 +56,7 @@ def _pose(angle: float) -> np.ndarray:
 
 
 def _box(pose: np.ndarray, textures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (h, w, 3) and where the rays meet the box from -0.7 to 0.7 (slab test)."""
+    """Return colours (h, w, 3) and the rays' intersections with the box from -0.7 to 0.7 (slab test)."""
     width, height = SIZE
     v, u = np.mgrid[0:height, 0:width] + 0.5
     rays = np.stack([(u - width / 2) / FOCAL, (v - height / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:3, :3].T

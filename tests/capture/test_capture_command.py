@@ -1,4 +1,4 @@
-"""`capture` on broken and unusual captures: goes on and says so, or refuses in one line and keeps what was there."""
+"""`capture` on broken and unusual captures: it continues with a message, or refuses in one line and changes nothing."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ LARGE = (SIZE[0] * 8, SIZE[1] * 8)
 
 @pytest.fixture
 def capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """Runs the command on c/, expects its exit status, and gives what it said."""
+    """Run the command on c/, check its exit status, and return its output."""
 
     def run(*more: str, status: int = 0) -> str:
         capsys.readouterr()
@@ -109,7 +109,7 @@ def test_masks_of_one_colour_or_another_size_are_left_out(tmp_path: Path, captur
     Image.fromarray(np.zeros_like(disc())).save(masks[1])
     Image.fromarray(np.full_like(disc(), 255)).save(masks[2])
     Image.fromarray(disc()).resize((50, 50)).save(masks[3])
-    Image.fromarray(disc()).resize((SIZE[0] // 2, SIZE[1] // 2)).save(masks[4])  # the same shape
+    Image.fromarray(disc()).resize((SIZE[0] // 2, SIZE[1] // 2)).save(masks[4])  # the mask keeps its shape
     said = capture()
     found = read_capture(tmp_path / "out")
     assert [path is None for path in found.mask_paths] == [False, True, True, True, *[False] * 6]
@@ -133,7 +133,7 @@ def test_large_photos_are_reduced_once_with_masks_and_exposure(tmp_path: Path, c
     change(tmp_path / "c", 3, file_path="images/0003.jpg")
     capture("--max-side", "200")
     found, given = read_capture(tmp_path / "out"), read_capture(tmp_path / "c")
-    # the others are referred to where they are
+    # the other images stay in their folder
     inside = [path.resolve().is_relative_to(tmp_path / "out") for path in found.image_paths]
     assert inside == [i == 3 for i in range(10)]
     assert images.stored_size(found.image_paths[3]) == SIZE
@@ -193,10 +193,10 @@ def test_heic_is_read(tmp_path: Path) -> None:
     import pillow_heif
 
     pillow_heif.register_heif_opener()
-    pixels = texture(1)[..., :1].repeat(3, -1)  # HEIC halves the resolution of colour alone
+    pixels = texture(1)[..., :1].repeat(3, -1)  # HEIC halves the resolution of colour only
     Image.fromarray(pixels).save(tmp_path / "a.heic", quality=95)
     assert images.list_images(tmp_path) == [tmp_path / "a.heic"]
-    # lossy, but close to what was written
+    # lossy, but close to the original
     assert float((images.read_rgb(tmp_path / "a.heic") - torch.from_numpy(pixels).float() / 255).abs().mean()) < 0.03
     assert images.stored_size(tmp_path / "a.heic") == SIZE
 
@@ -267,7 +267,7 @@ def test_a_zip_whose_photos_are_damaged_inside_leaves_nothing(tmp_path: Path) ->
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"c\.zip: expected a \.zip of photos, found one that cannot be read"):
         unpack_photos(path, tmp_path / "photos")
-    # of bzip2, zipfile would unpack the whole at once, however large it is
+    # zipfile would unpack all of a bzip2 at once, at any size
     with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as archive:
         archive.writestr("0.png", bytes(1000))
     with pytest.raises(ValueError, match=r"c\.zip: expected a \.zip of photos, found one that is not deflated"):
@@ -277,7 +277,7 @@ def test_a_zip_whose_photos_are_damaged_inside_leaves_nothing(tmp_path: Path) ->
 
 @pytest.fixture
 def doubtful(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """A project, and a COLMAP that answers with all photos and an error of 1.05 px; every call is noted."""
+    """Return a project, and a COLMAP that answers with all photos and an error of 1.05 px. Every call is recorded."""
     calls: list[str] = []
 
     def answer(job, advance, say):
@@ -332,5 +332,5 @@ def test_held_out_views_far_below_the_rest_are_named() -> None:
     worse = far_worse(usual | {"odd": 14.0, "turned": 11.0})
     assert list(worse) == ["turned", "odd"]
     assert all(name in sentence for name, sentence in worse.items())
-    # where views differ a lot all in all, the deviation is 1.4826 x 3 dB, and three of them lie below every view
+    # if views differ much, the deviation is 1.4826 x 3 dB, and three deviations lie below every view
     assert far_worse({f"photo_{i}": 18.0 + i for i in range(13)}) == {}

@@ -1,4 +1,4 @@
-"""The COLMAP process as it is called: masks where the background does not move, and runs that are killed."""
+"""The COLMAP process: masks before a still background, and killed runs."""
 
 import json
 import random
@@ -56,7 +56,7 @@ def test_an_object_on_a_turntable_is_posed_by_its_masks(tmp_path: Path) -> None:
     job = job_of(tmp_path, "masked", masks=True)
     masked = finish(job)
     whole = json.loads((job.folder / "answers" / "global, all pairs.json").read_text())
-    assert whole["explained"] < 0.5  # what the still wall says is another motion
+    assert whole["explained"] < 0.5  # the still wall shows another motion
     assert masked["database"] == "masked"
     assert len(masked["images"]) == 12
     assert masked["images"][0]["camera"][0] == pytest.approx(FOCAL, rel=0.03)
@@ -107,7 +107,7 @@ from colmap_process.job import Job
 folder = Path(sys.argv[2])
 pycolmap.set_random_seed(0)
 """
-"""pycolmap shares no process with Pillow: what calls it runs in one of its own."""
+"""First lines of the programs below. pycolmap shares no process with Pillow, so each runs in a process of its own."""
 
 
 def printed_by(program: str, folder: Path) -> str:
@@ -131,7 +131,7 @@ for i in photos[7:]:
 job = Job(str(folder), "", str(folder), False, [[truth.images[i].name for i in photos]], True, 1, 0)
 assert refined(job, folder / "photos.db", [part]).num_reg_images() == 10
 """
-"""A synthetic model without three of its ten photos."""
+"""Refines a synthetic model without three of its ten photos."""
 
 
 def test_photos_that_no_model_holds_are_posed_from_the_points_of_the_others(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ with pycolmap.Database.open(folder / "photos.db") as opened:
 job = Job("", "", str(folder), False, [[image.name for image in truth.images.values()]], True, 2, 0)
 print(_promising_pairs(job, folder / "photos.db").read_text())
 """
-"""Forty photos that all show the same points, as those before a background that stands still do."""
+"""Matches forty photos that all show the same points, as photos before a still background do."""
 
 
 def test_where_all_photos_match_each_is_compared_with_its_best_partners_alone(tmp_path: Path) -> None:

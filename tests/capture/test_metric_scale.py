@@ -18,7 +18,7 @@ def project(index, points):
 
 
 def pictures_of_marker(side, name, number, *, shown=range(6), shift=0.0):
-    """A marker of `side` world units flat on the ground with its white border; `shift` moves it in every picture."""
+    """Draw a marker of `side` world units flat on the ground with a white border; `shift` moves it in every picture."""
     board = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)), number, 320)
     board = np.pad(board, 80, constant_values=255)
     half = side / 2 * 480 / 320

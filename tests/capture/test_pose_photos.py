@@ -1,4 +1,4 @@
-"""Structure from motion: errors that help, doubts about its figures, and photos whose true poses are known."""
+"""Structure from motion: helpful errors, doubtful figures, and photos with known true poses."""
 
 import math
 from dataclasses import replace
@@ -51,14 +51,14 @@ def circle(count, height=1.0):
 
 
 def model_of(posed, photos):
-    """What the COLMAP process answers: so many photos with a pose."""
+    """Return the answer of the COLMAP process with this number of posed photos."""
     unposed = [{"name": f"{i:02d}.jpg", "features": 900, "matches": 12} for i in range(posed, photos)]
     return colmap_answer([f"{i:02d}.jpg" for i in range(posed)], circle(posed), (40, 30), unposed=unposed)
 
 
 @pytest.fixture
 def answer(monkeypatch):
-    """Puts given models in place of COLMAP's."""
+    """Replace COLMAP's models by given ones."""
     monkeypatch.setattr(structure_from_motion, "find_spec", lambda name: object())
 
     def give(*models):
@@ -128,7 +128,7 @@ def test_a_full_quick_model_needs_no_second_effort_and_masks_are_undistorted_lik
     assert [path and path.relative_to(tmp_path).as_posix() for path in posed.mask_paths] == [None, "masks/01.png", None]
     carried = posed.mask(1)
     assert carried.shape == posed.image(1).shape[:2]
-    # the middle column stays where it is, since the principal point is in the middle
+    # the middle column stays, because the principal point is in the middle
     assert carried[:, :19].min() == 1
     assert carried[:, 21:].max() == 0
 
@@ -146,7 +146,7 @@ def test_photos_on_their_side_are_turned_with_their_masks_and_that_is_said(tmp_p
     masks = (tmp_path / "mask.png", *[None] * (count - 1))
     posed, _ = pose(replace(photos, masks=masks), tmp_path, say=said.append)
     assert posed.cameras.sizes.tolist() == [[30, 40]] * count
-    # clockwise: what was on the left is on top
+    # clockwise: the left side is now on top
     carried = posed.mask(0)
     assert carried.shape == posed.image(0).shape[:2] == (40, 30)
     assert carried[:19].min() == 1
@@ -252,19 +252,19 @@ def test_in_any_frame_the_floor_comes_to_z_zero_with_cameras_above_at_a_median_d
     assert moved[:600, 2].abs().max() < 0.005
     assert (centers[:, 2] > 0.2).all()
     assert (moved[600:, 2] > -0.005).all()
-    middle = found.points(points.median(0).values)  # a median by coordinate, so taken in the frame that upright saw
+    middle = found.points(points.median(0).values)  # a median per coordinate, in the frame of `upright`
     # float32 at distances of about ten
     assert torch.isclose((centers - middle).norm(dim=1).median(), torch.tensor(1.0), atol=1e-4)
     wall = torch.rand(500, 3, generator=generator)
     wall[:, 0] = 0
     assert dominant_level_plane(wall, UP) is None
-    # without a plane the cameras say what is up; these are exactly level, and exact then up to a prior
+    # without a plane the cameras define up; these are exactly level, so up is exact except for a prior
     turn = upright(cameras, lost.points(torch.randn(400, 3, generator=generator)))
     assert float((turn.rotation @ rotation @ UP)[2]) > math.cos(math.radians(1))
 
 
 def corner_photo(camera):
-    """Three textured planes that meet, seen by a pinhole: rays meet the nearest plane, textures are looked up."""
+    """Render three textured planes by a pinhole: rays meet the nearest plane, textures are looked up."""
     width, height = camera.width, camera.height
     v, u = np.mgrid[0:height, 0:width] + 0.5
     k, pose = camera.intrinsics[0].numpy(), camera.world_from_camera[0].numpy()
@@ -301,11 +301,11 @@ def test_true_poses_come_back_and_crops_have_their_optical_axis_where_it_was(tmp
     # a third of a pixel at a focal length of 400 and a distance of 4 is 3 mm; hundreds of points share it, but focal
     # length and distance trade against each other: one percent of the path's 2 m
     assert distance < 0.02
-    # the floor, which fills most of the pictures, lies level
+    # the floor fills most of the pictures and is level
     assert rotation[2, 2] > math.cos(math.radians(5))
     for i in (3, 6):
-        # an optical axis off by d pixels is made up for by a turn of d / 400: a tenth of the 60 px that it is off, and
-        # as much of the turn against the next whole photo
+        # a turn of d / 400 makes up for an optical axis off by d pixels: a tenth of the 60 px that it is off, and
+        # a tenth of the turn against the next whole photo
         assert posed.cameras.intrinsics[i, :2, 2].tolist() == pytest.approx([200, 150], abs=6)
         found, true = (c.world_from_camera[[i, i + 1], :3, :3].double() for c in (posed.cameras, truth))
         turn = found[0].T @ found[1] @ (true[0].T @ true[1]).T
@@ -316,7 +316,7 @@ def test_true_poses_come_back_and_crops_have_their_optical_axis_where_it_was(tmp
 @pytest.mark.long
 @needs_colmap
 def test_bananas_on_a_carpet_are_one_model_with_the_known_poses(tmp_path: Path) -> None:
-    """Sixteen photographs whose shipped poses come from a run with many more features, at twice the size.
+    """Pose sixteen photographs whose shipped poses come from a run with many more features, at twice the size.
 
     Incremental mapping of these smaller photos finds four models, the largest with 8 photos; the global mapper joins
     them.
@@ -330,7 +330,7 @@ def test_bananas_on_a_carpet_are_one_model_with_the_known_poses(tmp_path: Path) 
     found = posed.cameras.world_from_camera.double()
     focal = float(known.cameras.intrinsics[0, 0, 0])
     assert report.lenses[0].focal_px == pytest.approx(focal, rel=0.01)  # two runs of the same photos
-    # the two worlds differ by a turn: the mean of the turns between them, by SVD; what is left is the error
+    # the two worlds differ by a rotation: the mean rotation between them, by SVD; the rest is the error
     turns = truth[:, :3, :3] @ found[:, :3, :3].transpose(1, 2)
     u, _, vt = torch.linalg.svd(turns.sum(0))
     trace = ((u @ vt).T @ turns).diagonal(dim1=1, dim2=2).sum(1)

@@ -1,4 +1,4 @@
-"""Photos that do not belong are found and others are not; views that are too few or in one place are refused."""
+"""Photos that do not belong are found and others are not; captures with too few views or one viewpoint are refused."""
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ def test_different_sharp_photos_all_stay_also_one_of_less_contrast(tmp_path):
     photos = write_photos(tmp_path / "photos", 12)
     Image.fromarray((100 + texture(4) // 4).astype(np.uint8)).save(photos[4])
     assert find_odd_photos(photos) == ()
-    for i, photo in enumerate(photos):  # nor is any odd where all are soft
+    for i, photo in enumerate(photos):  # if all photos are soft, none is odd
         Image.fromarray(cv2.GaussianBlur(texture(i), (0, 0), 2)).save(photo)
     assert find_odd_photos(photos) == ()
 
@@ -57,7 +57,7 @@ def test_copies_are_found_also_saved_again_smaller_and_black(tmp_path):
     Image.fromarray(texture(3, photographed)).save(again[0], quality=80)
     Image.fromarray(texture(3, photographed)).resize((320, 240), Image.Resampling.LANCZOS).save(again[1])
     for photo in photos[:2]:
-        Image.new("RGB", SIZE).save(photo)  # no detail: nothing may be divided by it
+        Image.new("RGB", SIZE).save(photo)  # no detail, so the measure must not divide by it
     odd = find_odd_photos([*photos, *again])
     assert [one.name for one in odd] == [str(path) for path in (photos[1], *again)]
     assert all("0003.png, found a copy of it" in one.reason for one in odd[1:])
@@ -88,7 +88,7 @@ def cloud(count: int = 80) -> torch.Tensor:
 
 
 def side_by_side(count: int, step: float, distance: float) -> Cameras:
-    """Parallel cameras on a line, `distance` before the origin."""
+    """Return parallel cameras on a line, `distance` before the origin."""
     x = (torch.arange(count) - (count - 1) / 2) * step
     poses = torch.eye(4).repeat(count, 1, 1)
     poses[:, 0, 3], poses[:, 2, 3] = x, -distance
@@ -96,7 +96,7 @@ def side_by_side(count: int, step: float, distance: float) -> Cameras:
 
 
 def outwards(count: int) -> Cameras:
-    """From one place into all directions."""
+    """Return cameras at one place that look in all directions."""
     angle = torch.arange(count) * (2 * torch.pi / count)
     goal = torch.stack([angle.cos(), angle.sin(), torch.zeros(count)], -1)
     poses = torch.cat([look_at(torch.zeros(1, 3), g, torch.tensor([0.0, 0, 1])) for g in goal])

@@ -1,4 +1,4 @@
-"""Capture, video: sharp frames at equal steps of motion; pauses, cuts, and files that are no whole video."""
+"""Capture of video: sharp frames at equal steps of motion; pauses, cuts, and damaged files."""
 
 import wave
 
@@ -10,11 +10,11 @@ from splatgraft.capture import extract_frames
 
 SIZE = (160, 120)
 STEP_PX = 2
-"""The picture's motion from frame to frame: 1.25% of its width."""
+"""Motion of the picture from frame to frame: 1.25% of its width."""
 
 
 def world(seed: int = 0) -> np.ndarray:
-    """A textured wall, wide enough to pan along."""
+    """Return a textured wall, wide enough for a pan."""
     noise = np.random.default_rng(seed).integers(0, 255, (60, 400, 3), np.uint8)
     return cv2.resize(noise, (1600, 240), interpolation=cv2.INTER_CUBIC)
 
@@ -33,14 +33,14 @@ def write(path, frames):
 
 
 def extracted(path, count) -> tuple[list[int], str]:
-    """The numbers of the frames, and what is said."""
+    """Return the numbers of the frames, and the messages."""
     paths, notes = extract_frames(path, path.parent / "frames", count=count)
     assert all(cv2.imread(str(frame)).shape == (SIZE[1], SIZE[0], 3) for frame in paths)
     return [int(frame.stem.split("_")[1]) for frame in paths], "\n".join(note.text for note in notes)
 
 
 def test_each_frame_is_a_sharp_one(tmp_path):
-    """Of every eight frames two are sharp; four stretches of 16 frames have sharp ones in their middle."""
+    """Two of every eight frames are sharp; four stretches of 16 frames have sharp ones in their middle."""
     sharp = {i for i in range(64) if i % 8 in (3, 4)}
     frames = (view(world(), STEP_PX * i, blurred=i not in sharp) for i in range(64))
     chosen, _ = extracted(write(tmp_path / "walk.avi", frames), 4)

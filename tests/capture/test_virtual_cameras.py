@@ -24,7 +24,7 @@ def blobs(means: torch.Tensor, size: float = 0.05) -> Gaussians:
 
 
 def table(seed: int = 0) -> torch.Tensor:
-    """A level surface with things on it, z up, and a far cloud that is not looked at."""
+    """Return a level surface with objects on it, z up, and a far cloud outside of the subject."""
     generator = torch.Generator().manual_seed(seed)
     flat = torch.cat([2 * torch.rand(2000, 2, generator=generator) - 1, torch.zeros(2000, 1)], 1)
     things = 0.5 * torch.rand(800, 3, generator=generator) - torch.tensor([0.25, 0.25, 0.0])
@@ -39,7 +39,7 @@ def turned_up(rotation: torch.Tensor) -> tuple[torch.Tensor, str, bool]:
 
 def test_the_dense_part_is_the_table_not_the_cloud() -> None:
     centre, radius = dense_part(table())
-    assert float(centre.norm()) < 0.25  # a quarter of the table: the things pull the middle up
+    assert float(centre.norm()) < 0.25  # a quarter of the table, because the objects pull the middle up
     assert 0.4 < radius < 1.2
 
 
@@ -81,7 +81,7 @@ def test_a_wall_is_not_looked_at_from_behind() -> None:
 
 
 def room() -> Gaussians:
-    """Four walls, a floor and a ceiling."""
+    """Return four walls, a floor and a ceiling."""
     a, b = torch.meshgrid(torch.linspace(-1, 1, 24), torch.linspace(-1, 1, 24), indexing="ij")
     sides = [torch.stack([a, b, torch.full_like(a, c)], -1).reshape(-1, 3) for c in (-1.0, 1.0)]
     faces = torch.cat([side.roll(turn, 1) for side in sides for turn in range(3)])

@@ -1,4 +1,4 @@
-"""`adopt` of a scene that another tool wrote: what is printed, and what --axes and the capture change."""
+"""`adopt` of a scene from another tool: its messages, and the effect of --axes and the capture."""
 
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def test_a_project_names_the_axes_once(tmp_path):
 
 
 def table(n: int = 3000) -> Gaussians:
-    """A surface without symmetry: a wide plate and a tower off its middle."""
+    """Return a surface without symmetry: a wide plate and a tower off its middle."""
     g = torch.Generator().manual_seed(0)
     means = torch.rand(n, 3, generator=g) * torch.tensor([4.0, 0.1, 2.0])
     means[: n // 4] = torch.rand(n // 4, 3, generator=g) * torch.tensor([0.3, -2.0, 0.4]) + torch.tensor([0.5, 0, 0.2])
@@ -69,8 +69,8 @@ def test_a_scene_that_lies_elsewhere_than_its_capture_is_said_to_with_the_axes_i
     points = scene.means[::7]
     assert misfit_of(formats.SceneFile(scene), points + 0.005) is None
     for axes in ("RUB", "LUF", "RFU"):
-        wrong = change_axes(scene, rdf_from(axes).T)  # read as RDF, though it is `axes`
+        wrong = change_axes(scene, rdf_from(axes).T)  # read as RDF, although it is `axes`
         assert f'set axes = "{axes}"' in (misfit_of(formats.SceneFile(wrong), points) or "")
     assert "another frame" in (misfit_of(formats.SceneFile(scene), 10 * points + 3) or "")
-    # few points say nothing
+    # few points decide nothing
     assert misfit_of(formats.SceneFile(scene), torch.randn(5, 3) * 100) is None

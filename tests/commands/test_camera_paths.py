@@ -19,7 +19,7 @@ from splatgraft.workflow.flow import STEPS
 
 
 def steps(root: Path, cameras: Path) -> list[Step]:
-    """All steps with an option that names cameras, each with these cameras."""
+    """Return all steps with an option that names cameras, each with these cameras."""
     scene = root / "scene.ply"
     placement = root / "placement.json"
     return [
@@ -46,5 +46,5 @@ def test_cameras_are_a_folder_or_a_file_in_every_step(tmp_path: Path) -> None:
 def test_a_folder_without_cameras_is_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"expected transforms\.json, or a COLMAP model in sparse/0, found neither"):
         camera_files(tmp_path)
-    # what does not exist yet is said by whoever opens it
+    # a file that does not exist yet is reported by the step that opens it
     assert camera_files(tmp_path / "none.json") == (tmp_path / "none.json",)

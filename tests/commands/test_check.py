@@ -22,7 +22,7 @@ SIZE = (320, 240)
 
 
 def texture(seed: int) -> np.ndarray:
-    """Blotches of several sizes, which SIFT finds again."""
+    """Return blotches of several sizes, which SIFT finds again."""
     generator = np.random.default_rng(seed)
     layers = [cv2.resize(generator.random((h, 2 * h), np.float32), (1600, 400), interpolation=2) for h in (25, 60, 200)]
     mixed = sum(layers)
@@ -30,7 +30,7 @@ def texture(seed: int) -> np.ndarray:
 
 
 def walk(seed: int = 0, count: int = COUNT) -> list[np.ndarray]:
-    """Photos from a sideways walk along a wall with boards before it, which move twice as much in the picture."""
+    """Write photos of a sideways walk along a wall, with boards before it that move twice as much in the picture."""
     wall, boards = texture(seed), texture(seed + 100)
     width, height = SIZE
     photos: list[np.ndarray] = []
@@ -52,7 +52,7 @@ def save(folder: Path, photos: list[np.ndarray], *, exposure: Callable[[int], Ex
 
 
 def check(capture: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, dict], str]:
-    """Exit status, findings by subject and verdict."""
+    """Return exit status, and findings by subject and verdict."""
     capsys.readouterr()
     status = main(["check", str(capture), "--json"])
     found = json.loads(capsys.readouterr().out)
@@ -69,7 +69,7 @@ def test_good_photos_have_no_fault_and_few_are_said_to_be_in_one_line_per_subjec
     status, findings, verdict = check(save(tmp_path / "photos", walk()), capsys)
     assert (status, verdict, doubts(findings)) == (0, "good", set())
     assert "structure from motion" in findings["poses"]["text"]
-    # masks are found where capture finds them
+    # `check` finds masks in the same places as `capture`
     folder = save(tmp_path / "capture" / "images", walk(count=10))
     for photo in sorted(folder.iterdir())[:3]:
         Image.new("L", SIZE, 255).save(folder / f"{photo.stem}_mask.png")
@@ -104,7 +104,7 @@ def test_faulty_photos_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
         str(folder / name) for name in wanted["left out"]
     ]
     assert all(finding["remedy"] for subject, finding in findings.items() if subject in wanted)
-    # what capture can use stays: without photos that neighbours do not hold, fewer of the others get a pose
+    # a photo that `capture` can use stays: without neighbours, fewer of the others get a pose
     advice = " ".join(findings[subject]["remedy"] for subject in ("overlap", "exposure", "sizes"))
     assert "leave" not in advice
 
@@ -112,19 +112,19 @@ def test_faulty_photos_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_photos_in_no_order_hang_together_by_whatever_shows_the_same_place(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # every line of the progress, however fast the machine is
+    # every line of the progress, at any speed of the machine
     monkeypatch.setattr("splatgraft.runtime.console._LINE_SECONDS", 0.0)
     wall = np.hstack([texture(seed) for seed in range(5)])
     width, height = SIZE
     # each shows what two or three others show
     photos = [wall[:height, 150 * i : 150 * i + width] for i in np.random.default_rng(1).permutation(COUNT)]
-    photos[3] = np.rot90(photos[3])  # held on its side, which is no other camera
+    photos[3] = np.rot90(photos[3])  # held on its side by the same camera
     assert main(["check", str(save(tmp_path / "photos", photos)), "--json"]) == 0
     printed = capsys.readouterr()
     found = json.loads(printed.out)
     levels = {finding["subject"]: finding["level"] for finding in found["findings"]}
     assert (found["verdict"], levels["overlap"], levels["sizes"]) == ("good", "good", "good")
-    # which takes longest of all
+    # the step that takes longest
     assert "looking for partners" in printed.err
 
 

@@ -1,4 +1,4 @@
-"""The whole job on a tiny scene, through the commands: done once, redone only where stale, whole after every kill."""
+"""The whole flow on a tiny scene, through the commands: done once, redone only if stale, intact after every kill."""
 
 import json
 import os
@@ -53,7 +53,7 @@ def test_everything_is_made_and_fresh_wherever_the_project_lies(
     )
     assert torch.equal(composite.means, result.means)
     assert torch.equal(composite.opacity_logits, result.opacity_logits)
-    # no harmoniser, and images of 8 bits are off by half a level at most, which counts as unchanged: the very colours
+    # no harmoniser, and images of 8 bits are off by half a level at most, which counts as unchanged: the same colours
     assert torch.equal(relit.sh, result.sh)
     for name in ("index.html", "before.png", "after.png", "turntable.gif"):
         assert (layout.report / name).is_file()
@@ -61,7 +61,7 @@ def test_everything_is_made_and_fresh_wherever_the_project_lies(
     assert "<h2>Depth and normals</h2>" in page
     for label in ("Depth", "Normals"):
         (name,) = re.findall(rf'src="(geometry/0000_\d\.webp)" alt="{label} ', page)
-        # the plane and the ball are in it: several colours
+        # the plane and the ball are in it, so it has several colours
         assert read_rgb(layout.report / name).flatten(0, 1).std(0).max() > 0.05
     record = read_record(layout.harmonized)
     assert record is not None
@@ -80,7 +80,7 @@ def test_a_changed_input_makes_stale_what_depends_on_it_and_nothing_else(
     assert reasons["source/capture"] == "masks: view_0000.png changed"
     before = contents(project.parent / "source" / "scene")
     assert main(["run", str(project), "--to", "source/reconstruct"]) == 0
-    # the capture came out as it was, so nothing had to be trained again; only the masks are new to segment
+    # the capture is unchanged, so nothing is trained again; only the masks are new to segment
     assert any(
         line.split() == ["source/reconstruct", "up", "to", "date"] for line in capsys.readouterr().err.splitlines()
     )
@@ -194,7 +194,7 @@ def test_no_masks_are_cut_from_the_images_and_the_choice_is_said(
 
 
 def test_killed_inside_any_step_earlier_results_stay_whole_and_run_finishes(project: Path) -> None:
-    """Every step is asked for again and killed at one of its writes, then all is brought up to date."""
+    """Request every step again, kill it at one of its writes, then bring all up to date."""
     generator = random.Random(0)
     wanted = {step.out: contents(step.out) for _, step in read_flow(project)}
     for name, _ in read_flow(project):
@@ -204,7 +204,7 @@ def test_killed_inside_any_step_earlier_results_stay_whole_and_run_finishes(proj
         assert {folder: contents(folder) for folder in wanted} == wanted
     shutil.rmtree(project.parent / "source" / "scene")
     assert main(["run", str(project), "--force", "consolidate"]) == 0
-    # the same seeds give the same files, however often a run was cut
+    # the same seeds give the same files, after any number of kills
     assert {folder: contents(folder) for folder in wanted} == wanted
     assert not list(project.parent.rglob(".*.checkpoint"))
 
@@ -245,12 +245,12 @@ def counted(old, new):
 os.replace = counted
 main(sys.argv[1:])
 """
-"""`splatgraft` with frequent checkpoints, which stops for good behind the third."""
+"""Program that runs `splatgraft` with frequent checkpoints, and sleeps forever after the third."""
 
 
 @pytest.mark.long
 def test_each_long_step_goes_on_from_its_checkpoint_after_a_kill_inside_of_it(project: Path) -> None:
-    # posing photos is another process, which test_colmap_process.py kills
+    # another process poses photos, and test_colmap_process.py kills it
     (project.parent / "lpips").mkdir()
     write_random_lpips(project.parent / "lpips")
     options = 'method = "paper"\niterations = 40\nlpips_weights = "lpips"\n[harmonize]\nmethod = "compact"'

@@ -1,4 +1,4 @@
-"""Where there is no room on the disk, or no right to write, a command ends with one line and leaves what was there."""
+"""A command without room on the disk, or without the right to write, ends with one line and keeps earlier files."""
 
 import ctypes
 import errno
@@ -23,7 +23,7 @@ from splatgraft.workflow.flow import read_flow
 
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
-    """Let no file grow beyond this many bytes."""
+    """Limit the size of every file to this many bytes."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -34,7 +34,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 @contextmanager
 def read_only(folder: Path) -> Iterator[None]:
-    """Take the right to write into a folder, also from root."""
+    """Remove the right to write into a folder, also for root."""
     folders = [folder, *(path for path in folder.rglob("*") if path.is_dir())]
     for path in folders:
         path.chmod(0o555)
@@ -50,7 +50,7 @@ def read_only(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def heeding_permissions() -> Iterator[None]:
-    """Let this thread heed the permissions of files, as root too does without two of its capabilities."""
+    """Make this thread obey file permissions, as root does without two of its capabilities."""
     if os.geteuid() != 0:
         yield
         return
@@ -81,7 +81,7 @@ def test_a_writer_without_room_is_one_line_and_the_earlier_result_stays(
         try:
             raise OSError(errno.ENOSPC, "No space left on device")
         except OSError:
-            # as PyTorch's writer does while it closes the file
+            # like PyTorch's writer, which raises this while it closes the file
             raise RuntimeError("unexpected pos 64 vs 0")  # noqa: B904
 
     monkeypatch.setattr(Render, "write", write)
@@ -115,7 +115,7 @@ def test_a_read_only_project_is_up_to_date_or_says_what_it_cannot_write(
     finished: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     project, capture = finished.parent, str(finished.parents[1] / "photos" / "source")
-    (project / "source" / ".scene.new").mkdir()  # as a kill leaves it
+    (project / "source" / ".scene.new").mkdir()  # as after a kill
     commands = {
         "views": ["run", str(finished), "--force", "render"],
         ".edit.lock": ["edit", str(project)],
@@ -136,7 +136,7 @@ def test_a_read_only_project_is_up_to_date_or_says_what_it_cannot_write(
 
 
 def run(project: Path, *words: str, most_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
-    """`splatgraft run` with a limit on the size of each file."""
+    """Run `splatgraft run` with a limit on the size of each file."""
 
     def limited() -> None:
         if most_bytes is not None:

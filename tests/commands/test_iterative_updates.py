@@ -1,4 +1,4 @@
-"""Updates of `consolidate`: views are harmonised again from renders of the scene so far, with less and less noise."""
+"""Updates of `consolidate`: views are harmonised again from renders of the scene so far, with decreasing noise."""
 
 from dataclasses import replace
 
@@ -54,7 +54,7 @@ def test_every_update_begins_at_the_noise_of_the_schedule_on_renders_of_the_scen
     count = len(views)
     assert [strength for strength, _ in asked] == pytest.approx([0.1**0.5] * count + [0.1] * count)
     first, second = asked[0][1], asked[count][1]
-    # the composite is the condition of all; the first update starts from the scene of a single consolidation
+    # the composite is the condition of all updates; the first one starts from the scene of a single consolidation
     assert torch.equal(first.composite, views.read(0).composite)
     assert torch.equal(first.composite, second.composite)
     begun = render(read_gaussians(once / "scene.ply"), views.cameras[0]).color[0].clamp(0, 1)

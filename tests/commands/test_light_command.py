@@ -1,4 +1,4 @@
-"""`light`: its environment map and lamps light a sphere as the known light does; conventions; a project's light."""
+"""`light`: its environment map and lamps light a sphere like the known light; conventions; a project's light."""
 
 import json
 import math
@@ -19,15 +19,15 @@ from splatgraft.relighting.light.light import light_from_json
 
 SUN = torch.nn.functional.normalize(torch.tensor([-0.39, 0.67, 0.8]), dim=0)
 STRENGTH = 3.0
-"""Irradiance of the sun on what faces it, over the sky's on the floor."""
+"""Irradiance of the sun on a surface that faces it, over the sky's on the floor."""
 FLOOR = 0.15 * (1 + STRENGTH * float(SUN[2]))
-"""Linear value of the lit floor's pixels, of the albedo that `sunlit_scene` has."""
+"""Linear value of the lit floor's pixels, for the albedo of `sunlit_scene`."""
 CAPTURE_FROM_WORLD = torch.tensor([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
-"""A capture as structure from motion has it, y down, so turned that a .glb of it opens in Blender as the world."""
+"""Rotation into a capture with y down, turned so that its .glb opens in Blender as the world."""
 
 
 def pixels(height: int) -> tuple[Tensor, Tensor]:
-    """Directions and solid angles of a map, by the words of `--help`: top +z, middle column +x, to the right -y."""
+    """Return directions and solid angles of a map as in `--help`: top +z, middle column +x, to the right -y."""
     rows, columns = (torch.arange(n, dtype=torch.float64) + 0.5 for n in (height, 2 * height))
     up, right = math.pi * (0.5 - rows / height)[:, None], math.pi * (columns / height - 1)[None]
     directions = torch.stack([up.cos() * right.cos(), -up.cos() * right.sin(), up.sin() + 0 * right], -1)
@@ -41,7 +41,7 @@ def read_hdr(path: Path) -> Tensor:
 
 
 def lit_by_map(radiance: Tensor, normals: Tensor) -> Tensor:
-    """Irradiance (n 3) on planes."""
+    """Return irradiance (n 3) on planes."""
     directions, angles = (values.flatten(0, 1) for values in pixels(len(radiance)))
     return ((normals @ directions.T).clamp_min(0) * angles) @ radiance.flatten(0, 1)
 
@@ -56,7 +56,7 @@ def lit_by_lamps(path: Path, normals: Tensor) -> Tensor:
 
 @pytest.fixture(scope="module")
 def sunlit(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder with what `light` wrote of a scene under a sun and an even sky that no camera saw."""
+    """Return the folder that `light` wrote for a scene under a sun and an even sky that no camera saw."""
     folder = tmp_path_factory.mktemp("sunlit")
     turned = Similarity(1.0, CAPTURE_FROM_WORLD, torch.zeros(3))
     write_gaussians(folder / "target.ply", turned.gaussians(sunlit_scene(SUN, STRENGTH)))
@@ -76,11 +76,11 @@ def test_a_sphere_is_lit_as_by_the_known_sun_and_sky(sunlit: Path):
     known = by_sun + math.pi * (1 + normals[:, 2]) / 2 + FLOOR * math.pi * (1 - normals[:, 2]) / 2
     # normals lie 4.5 degrees apart, and the sun is found within 3
     assert float(normals[found.argmax()] @ normals[known.argmax()]) > math.cos(math.radians(8))
-    # the level of the light is free, as the floor's albedo is not known; of the sun's share 0.1 may be the sky's
+    # the level of the light is free, because the floor's albedo is unknown; 0.1 of the sun's share may be the sky's
     assert float((found / found.max() - known / known.max()).abs().max()) < 0.1
     top = normals[:, 2].argmax()
     share = float(by_lamps[top].mean() / found[top])
-    # 0.1 as in relighting/test_light.py, where Gaussians mix lit and shaded floor at the edges of shadows; and 0.01, as
+    # 0.1 as in relighting/test_light.py: Gaussians mix lit and shaded floor at the edges of shadows; and 0.01, because
     # the map's irradiance is within 3% of what harmonics of degree 2 give there
     assert share == pytest.approx(float(by_sun[top] / (by_sun[top] + math.pi)), abs=0.11)
 
@@ -122,7 +122,7 @@ def test_at_a_project_s_object_it_is_the_light_that_relight_finds(copy_project: 
     assert main(["relight", *given, "--fitted-views", "0"]) == 0
     assert main(["light", str(project), "--out", str(out), "--frame", "capture", "--height", "16"]) == 0
     assert out.with_suffix(".json").read_text() == (project / "again" / "light.json").read_text()
-    # a light that the project is given is the light: its ambient light is the map
+    # a light given to the project is used: its ambient light is the map
     light = json.loads(out.with_suffix(".json").read_text())
     ambient = [[0.5 / 0.28209479] * 3, *[[0.0] * 3] * 8]
     (project / "given.json").write_text(json.dumps(light | {"sources": [], "ambient_sh": ambient}))

@@ -1,4 +1,4 @@
-"""`relight` on explicit paths: which objects lose the old light, what is drawn; and what commands say of exposure."""
+"""`relight` on explicit paths: which objects lose the old light, pictures of the light, and messages on exposure."""
 
 import json
 import math
@@ -25,7 +25,7 @@ from splatgraft.project.placement import ObjectPlacement, Placement, write_place
 
 
 def room(gray: float) -> Gaussians:
-    """A plane inside a large sphere."""
+    """Return a plane inside a large sphere."""
     away = 20 * even_directions(2000)
     return concatenate([plane((gray, gray, gray)), surfels(away, -away, width=1.0, srgb=gray)])
 
@@ -37,7 +37,7 @@ def relit(
     *more: str,
     exposures: dict[str, list[Exposure]] | None = None,
 ) -> Path:
-    """The result of `relight` for a target, a source around a ball, and objects with their places by file."""
+    """Return the result of `relight` for a target, a source around a ball, and objects with their places by file."""
     for name, scene, thing in (("target", rooms[0], None), ("source", rooms[1], ball())):
         photograph(folder / name, scene, thing)
         write_gaussians(folder / f"{name}.ply", scene)
@@ -80,7 +80,7 @@ def test_the_lights_of_both_places_are_drawn_past_an_object_without_gaussians(tm
     objects = {"nothing.ply": (nothing, [at(0, 0)]), "own.ply": (ball(), [at(0, 0)])}
     found = relit(tmp_path, (room(0.8), room(0.25)), objects)
     drawn = {path.name: read_rgb(path) for path in found.glob("*.png")}
-    # numbered as the placement's objects, as in the report
+    # numbers of the placement's objects, as in the report
     assert "Where object 2 comes from" in (found / "light.txt").read_text()
     assert sorted(drawn) == ["light.png", "source_light_2.png"]
     assert {picture.shape for picture in drawn.values()} == {(256, 768, 3)}
@@ -139,7 +139,7 @@ def test_undistorted_photos_keep_the_exposure_and_no_other_metadata(tmp_path: Pa
 
 
 def exposure_lines(folder: Path, exposures: dict[str, list[Exposure]]) -> list[str]:
-    """What light.txt says of exposure where a ball is moved between two rooms of one picture."""
+    """Return the lines on exposure in light.txt for a ball that is moved between two rooms of one picture."""
     found = relit(folder, (room(0.5), room(0.5)), {"own.ply": (ball(), [at(0, 0, 1.0)])}, exposures=exposures)
     return [line for line in (found / "light.txt").read_text().splitlines() if "exposure" in line]
 
@@ -149,9 +149,9 @@ def test_relight_compares_the_levels_of_both_captures(tmp_path: Path):
     (line,) = exposure_lines(tmp_path, {"target": [fixed(1 / 800)], "source": [fixed(1 / 100)]})
     assert "by the exposure of the photos" in line
     by_photos, by_light = (float(words.split()[-1]) for words in line.split(" stops brighter")[:2])
-    # the source's photos show the ball too, which is darker: a tenth of a stop or two
+    # the source's photos also show the darker ball: a tenth of a stop or two
     assert by_photos == pytest.approx(3, abs=0.3)
-    # the same ratio is told in lux, rounded to two digits each
+    # the same ratio in lux, rounded to two digits each
     words = line.replace(",", "").split()
     new, old = float(words[words.index("lux") - 1].lstrip("(")), float(words[words.index("at", words.index("lux")) - 1])
     assert by_light == pytest.approx(math.log2(new / old), abs=0.2)
@@ -165,7 +165,7 @@ def test_a_sun_through_a_point_and_its_shadow_is_the_light_and_the_report_says_s
     points = ["--sun-through", "0.5", "0", "0.4", "0.1", "0", "0", "0.5", "0.02", "0.4", "0.1", "0.02", "0"]
     out = relit(tmp_path, (room(0.5), room(0.5)), {"own.ply": (ball(), [at(0, 0)])}, *points)
     sources = json.loads((out / "light.json").read_text())["sources"]
-    # the floor of the room shows no shadow whose edge would tell its strength
+    # the floor of the room shows no shadow whose edge gives its strength
     assert [source["name"] for source in sources if "sun" in source["name"]] == [
         "sun set by hand, its strength estimated"
     ]

@@ -1,4 +1,4 @@
-"""The step `render`: how reliable the prior is comes from the light file that it is handed, and from nowhere else."""
+"""The step `render`: the confidence of the prior comes only from the given light file."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ LIGHT = Light((LightSource((0.0, 0.0, 1.0), (2.0, 2.0, 2.0), confidence=0.5),), 
 
 @pytest.fixture
 def step(tmp_path: Path) -> Render:
-    """A composite and, in another folder, a prior."""
+    """Write a composite and, in another folder, a prior."""
     scene = concatenate([plane((0.5, 0.5, 0.5)), ball()])
     photograph(tmp_path / "target", plane((0.5, 0.5, 0.5)), None)
     (tmp_path / "relit").mkdir()
@@ -43,7 +43,7 @@ def test_the_confidence_is_that_of_the_light_which_is_handed_over(step: Render) 
     # prior.json has four decimals
     assert confidence(step) == round(light_confidence(LIGHT), 4) > 0
     assert job_of(step).inputs["light"] == (step.light,)
-    # a light.json that only lies beside the prior is not looked for
+    # a light.json beside the prior is not read unless it is given
     assert confidence(Render(**{**vars(step), "light": None})) == 0
 
 

@@ -67,7 +67,7 @@ def test_sizes_in_metres_of_both_captures_give_the_object_its_size(captures: Pat
     assert composed(captures) == 0
     assert "as large as it was" in capsys.readouterr().err
     assert placed(captures).scale == pytest.approx(0.5 / found.metres_per_unit, rel=1e-5)
-    # what the user says comes first
+    # the user's scale overrides the stored one
     assert composed(captures, "--scale", "0.7") == 0
     assert placed(captures).scale == pytest.approx(0.7)
 

@@ -1,4 +1,4 @@
-"""What a run says beforehand about its duration, of captures of every kind."""
+"""The time estimate that a run prints first, for captures of every kind."""
 
 import json
 from dataclasses import asdict
@@ -62,7 +62,7 @@ def test_what_a_draft_took_is_not_what_a_better_one_takes(tmp_path: Path) -> Non
     assert again["source/reconstruct"] == draft["source/reconstruct"]
     high = seconds(tmp_path, reconstruct='quality = "high"')
     assert high["target/reconstruct"] > 10 * draft["target/reconstruct"]
-    # the object is fitted by itself
+    # the object has a fit of its own
     assert high["source/reconstruct"] == draft["source/reconstruct"]
     boxed = seconds(tmp_path, reconstruct='quality = "high"', segment='mask_source = "box"')
     assert boxed["source/reconstruct"] > 10 * draft["source/reconstruct"]

@@ -1,4 +1,4 @@
-"""`splatgraft try` on generated captures: no question, a report at the end, and what to do next."""
+"""`splatgraft try` on generated captures: no question, a report at the end, and the next steps."""
 
 import os
 import tomllib
@@ -30,7 +30,7 @@ def test_a_first_transfer_needs_nothing_but_two_captures(
     captures: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    # a desktop that opens pages: a program that writes down what it is given
+    # a desktop that opens pages: a program that records its arguments
     opener = tmp_path / "bin" / "xdg-open"
     opener.parent.mkdir()
     opener.write_text('#!/bin/sh\necho "$1" > opened.txt\n')
@@ -56,7 +56,7 @@ def test_a_first_transfer_needs_nothing_but_two_captures(
     assert len([line for line in said if line.startswith("helps most: ") and len(line) > 20]) == 1
     assert "splatgraft run images__into_room" in next(line for line in said if line.startswith("finer: "))
     assert f"{page}: opened in the browser" in said
-    # without --draft it goes on to a finer result, and does not pose the photos again
+    # without --draft it continues to a finer result, and does not pose the photos again
     toml = page.parents[1] / "project.toml"
     toml.write_text(toml.read_text() + "# mine\n")
     assert main(["try", *captures, "--keep-closed"]) == 0
@@ -69,7 +69,7 @@ def test_a_first_transfer_needs_nothing_but_two_captures(
     assert "capture       begins" not in again
     assert 'finer: quality = "high"' in again
     assert tomllib.loads(toml.read_text())["reconstruct"]["quality"] == "standard"
-    # a third time there is nothing to do, and what was written into the project stays
+    # a third time nothing is stale, and changes of the project file stay
     assert main(["try", *captures, "--keep-closed"]) == 0
     assert "begins" not in capsys.readouterr().err
     assert toml.read_text().endswith("# mine\n")
@@ -127,7 +127,7 @@ def test_what_cannot_be_used_and_a_folder_of_the_same_name_are_left_alone(
     (tmp_path / "images__into_room" / "letter.txt").write_text("mine")
     began: list[Path] = []
     monkeypatch.setattr(first_try, "run_steps", lambda project, *_, **__: began.append(project))
-    for _ in range(2):  # a second time the same project goes on
+    for _ in range(2):  # a second time the same project continues
         assert main(["try", source, target, "--keep-closed"]) == 0
     assert began == [Path("images__into_room_2") / "project.toml"] * 3  # draft, standard, and nothing new
     assert [path.name for path in (tmp_path / "images__into_room").iterdir()] == ["letter.txt"]

@@ -1,4 +1,4 @@
-"""Every warning of a run stands in step.json of its step and, with its picture, at the top of the report."""
+"""Every warning of a run is in step.json of its step and, with its picture, at the top of the report."""
 
 import shutil
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from splatgraft.workflow.flow import read_flow
 
 @dataclass(frozen=True)
 class Doubtful:
-    """A step that warns of its own picture and of a photo elsewhere."""
+    """Step that warns with its own picture and with a photo elsewhere."""
 
     photo: Path
     out: Path
@@ -66,7 +66,7 @@ def test_a_warning_is_recorded_with_its_picture_relative_to_the_result(
 def test_the_report_begins_with_all_warnings_of_the_run(
     copy_project: Callable[[], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # the object stands where nothing was captured, so that there is no light to be found
+    # nothing was captured around the object, so no light can be found
     warned = copy_project() / "project.toml"
     warned.write_text(warned.read_text().replace('light = "off"', 'light = "transfer"'))
     far = Similarity(1.0, torch.eye(3), torch.tensor([500.0, 0.0, 0.0]))
@@ -122,5 +122,5 @@ def test_exposures_are_warned_of_once_in_a_run(tmp_path: Path, capsys: pytest.Ca
     said = [line for line in lines if "expected one exposure" in line]
     assert len(said) == 2
     assert len(set(said)) == 2
-    # nor is the device, which all steps share
+    # the device is missing too, because all steps share it
     assert sum(line.startswith("device: ") for line in lines) == 1

@@ -35,7 +35,7 @@ TABLE = 0.7
 
 
 def sheet(center, u, v, *, spacing=0.06, noise=0.004, seed=0):
-    """Flat Gaussians on the parallelogram center +- u +- v."""
+    """Return flat Gaussians on the parallelogram center +- u +- v."""
     g = torch.Generator().manual_seed(seed)
     center, u, v = (torch.tensor(x, dtype=torch.float32) for x in (center, u, v))
     nu, nv = (max(2, math.ceil(2 * float(x.norm()) / spacing)) for x in (u, v))
@@ -101,7 +101,7 @@ def ring_of_cameras(center=(0.0, 0, TABLE), count=16, height=0.7, distance=1.6):
 
 
 def outward(cameras: Cameras) -> Cameras:
-    """The same cameras, turned round."""
+    """Return the same cameras, rolled."""
     poses = cameras.world_from_camera.clone()
     poses[:, :3, [0, 2]] *= -1
     return replace(cameras, world_from_camera=poses)
@@ -109,7 +109,7 @@ def outward(cameras: Cameras) -> Cameras:
 
 THING = box((0, 0, 0.15), (0.1, 0.1, 0.15))
 OWN = ring_of_cameras((0.0, 0, 0.15), height=0.5)
-"""An object and the cameras of its capture."""
+"""Object and the cameras of its capture."""
 
 
 TURN = Similarity(
@@ -149,7 +149,7 @@ def test_support_is_the_table_under_a_ceiling_and_through_floaters(start):
 
 
 def glossy_room():
-    """A table top that lets light through, and its reflections deep below it, as a fit of photos makes them."""
+    """Return a table top that lets light through, with its reflections deep below it, like a fit of photos."""
     table = sheet((0, 0, TABLE), (0.6, 0, 0), (0, 0.4, 0), spacing=0.03)
     table = replace(table, opacity_logits=torch.full((table.count,), -0.4))
     below = sheet((0, 0, TABLE - 0.4), (0.6, 0, 0), (0, 0.4, 0), spacing=0.05, noise=0.1, seed=3)
@@ -206,7 +206,7 @@ def test_a_wall_is_a_poor_support_and_a_hole_below_a_point_takes_the_level_aroun
 
 
 def rubble():
-    """Boxes of different heights all over the floor, none as large as the object."""
+    """Return boxes of different heights all over the floor, all smaller than the object."""
     g = torch.Generator().manual_seed(5)
     places = torch.cartesian_prod(torch.linspace(-0.8, 0.8, 9), torch.linspace(-0.8, 0.8, 9))
     heights = 0.1 + 0.5 * torch.rand(len(places), generator=g)
@@ -246,7 +246,7 @@ def test_nothing_at_all_is_said():
 
 def test_base_comes_from_the_surface_where_the_source_has_one():
     table = sheet((0, 0, 0), (1, 0, 0), (0, 1, 0))
-    # a hole where the box stood, and 3 cm of the table's top left on the box by its mask
+    # a hole under the box, and 3 cm of the table's top left on the box by its mask
     hole = (table.means[:, :2].abs().amax(-1)) > 0.1
     thing = concatenate([THING, sheet((0, 0, -0.02), (0.1, 0, 0), (0, 0.1, 0))])
     own = object_base(thing, up=UP)
@@ -307,7 +307,7 @@ def test_an_automatic_place_is_on_the_table_in_sight_and_free():
     placed = place_object(room(), THING, cameras=(ring_of_cameras(), OWN))
     assert abs(float(placed.support.point[2]) - TABLE) < 0.015
     assert placed.support.point[:2].abs().max() < 0.5
-    assert placed.hidden_fraction < 1 / 6  # the share of the underside
+    assert placed.hidden_fraction < 1 / 6  # share of the underside
     assert placed.warnings == ()
     # three tenths of 120 px: at 1.6-1.8 m and a focal length of 150 px that is 0.4 m, for 0.3 m of height
     assert 0.8 < placed.target_from_object.scale < 1.8
@@ -395,7 +395,7 @@ def test_a_place_is_away_from_the_table_s_edge_and_a_warning_says_where_none_is(
         return place_object(table, thing, cameras=(cameras, cameras), options=PlaceOptions(scale=1.0))
 
     found = placed(0.07)
-    # of three times its radius of .07 to .1, which would keep .3 from the edge at .6, most is kept
+    # most of the triple radius of .07 to .1 is kept, which would be .3 from the edge at .6
     assert found.support.point[0] < 0.4
     assert found.support.point[1].abs() < 0.2
     assert not any("edge" in note.text for note in found.warnings)
@@ -405,13 +405,13 @@ def test_a_place_is_away_from_the_table_s_edge_and_a_warning_says_where_none_is(
 def test_a_size_that_is_guessed_does_not_fill_a_small_table():
     small = sheet((0, 0, TABLE), (0.3, 0, 0), (0, 0.3, 0), spacing=0.03)
     placed = place_object(small, THING, cameras=(ring_of_cameras(), OWN))
-    # its rim keeps its own width from the edge where it can: at 3 radii from the middle about .7 of the disc is table
+    # its rim keeps its own width from the edge if possible: at 3 radii from the middle about .7 of the disc is table
     assert placed.target_from_object.scale * 2 * placed.base.radius < 0.3
 
 
 def test_corners_do_not_reach_over_the_table_s_edge():
     cameras = cameras_that_look_at_the_edge()
-    # a bar that is too little of the object to count in its radius
+    # a bar too small to count in the object's radius
     bar = sheet((0, 0, 0.02), (0.165, 0, 0), (0, 0.005, 0), spacing=0.02)
     thing = concatenate([box((0.0, 0.0, 0.1), (0.1, 0.1, 0.1), spacing=0.015), bar])
     placed = place_object(room(), thing, cameras=(cameras, cameras), options=PlaceOptions(scale=1.0, yaw_deg=0.0))
@@ -420,7 +420,7 @@ def test_corners_do_not_reach_over_the_table_s_edge():
 
 
 def heap(radius, low, high, *, at=(0.0, 0.0), seed=0):
-    """Small Gaussians on the side and on the flat top of a cylinder."""
+    """Return small Gaussians on the side and on the flat top of a cylinder."""
     g = torch.Generator().manual_seed(seed)
     n = 1500
     angle, share = 2 * math.pi * torch.rand(n, generator=g), torch.rand(n, generator=g)
@@ -441,7 +441,7 @@ SHOULDER = TABLE + 0.6
 
 
 def figure_on_a_table():
-    """A figure with a flat shoulder and a head, on a wide table above a floor; darker and lighter for the picture."""
+    """Return a figure with a flat shoulder and a head, on a wide table above a floor, in different grays."""
     floor = sheet((0, 0, 0), (2, 0, 0), (0, 2, 0))
     table = sheet((0, 0, TABLE), (0.9, 0, 0), (0, 0.75, 0), spacing=0.03)
     head = heap(0.07, SHOULDER, SHOULDER + 0.2, at=(-0.14, 0.0), seed=1)
@@ -456,7 +456,7 @@ def cameras_that_look_at_the_figure():
 
 
 SLENDER = box((0, 0, 0.15), (0.04, 0.04, 0.15), spacing=0.02)
-"""An object that would have room on the figure's shoulder."""
+"""Object that would fit on the figure's shoulder."""
 
 
 def test_an_object_stands_beside_the_captured_figure_on_its_table():
@@ -467,7 +467,7 @@ def test_an_object_stands_beside_the_captured_figure_on_its_table():
         scale = placed.target_from_object.scale
         guess = scale_in_view(placed.base, torch.tensor([0.0, 0, SHOULDER - 0.02]), cameras=cameras)
         assert scale >= 0.5 * guess
-        # neither into the figure nor over the table's edge
+        # outside of the figure and inside the table's edge
         assert placed.support.point[:2].norm() > 0.22 + scale * placed.base.radius
         assert placed.support.point[0].abs() < 0.9 - scale * placed.base.radius
         assert placed.support.point[1].abs() < 0.75 - scale * placed.base.radius
@@ -475,14 +475,14 @@ def test_an_object_stands_beside_the_captured_figure_on_its_table():
 
 
 def test_a_bare_table_is_the_support_of_cameras_that_meet_below_it():
-    # by a sixteenth of their distance, as those of a hand do; the floor has four times the area
+    # turned by a sixteenth of their distance, like a hand-held camera; the floor has four times the area
     cameras = ring_of_cameras((0.0, 0, TABLE - 0.1))
     placed = place_object(room(), THING, cameras=(cameras, OWN))
     assert abs(float(placed.support.point[2]) - TABLE) < 0.02
 
 
 def full_table():
-    """The figure among things that leave gaps too small for the object, above a free floor."""
+    """Return the figure among objects that leave gaps too small for the placed object, above a free floor."""
     angle = torch.arange(10) / 10 * 2 * math.pi
     things = [
         heap(0.09, TABLE, TABLE + 0.15, at=(0.45 * math.cos(a), 0.45 * math.sin(a)), seed=10 + i)
@@ -499,12 +499,12 @@ def test_a_table_too_full_for_half_of_the_guess_is_refused_with_a_picture(tmp_pa
         NoFreePlaceError, match=r"at half of its guessed size or more, found one for \d\d% of it"
     ) as error:
         place_object(full_table(), THING, cameras=(cameras, OWN))
-    # green is where the free rim of the table is seen, red is the figure in the middle, the floor keeps its gray
+    # green marks the visible free rim of the table, red the figure in the middle; the floor keeps its gray
     tint = error.value.picture[..., 1] - error.value.picture[..., 0]
     assert float((tint > 0.1).float().mean()) > 0.01
     assert tint[50:70, 75:85].max() < -0.1
     assert (tint[:, :5].abs() < 0.01).all()
-    # a scale that is given is never refused
+    # a given scale is never refused
     placed = place_object(full_table(), THING, cameras=(cameras, OWN), options=PlaceOptions(scale=1.0))
     assert abs(float(placed.support.point[2])) < 0.02
     assert any("lower level" in note.text for note in placed.warnings)

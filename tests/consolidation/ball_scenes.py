@@ -47,13 +47,13 @@ def ring(views: int, size: int = 48) -> Cameras:
 
 
 def views_of(scene: Gaussians, cameras: Cameras, images: Sequence[Tensor], **changes) -> Views:
-    """Exact maps, which tests compare with the renderer."""
+    """Return views with exact maps, which tests compare with the renderer."""
     exact = ConsolidateOptions(min_row_weight=0.0, cache_bytes=2**24)
     return Views(scene, cameras, images, weights=changes.pop("weights", None), options=replace(exact, **changes))
 
 
 def basis_towards(scene: Gaussians, camera: Cameras) -> Tensor:
-    """Spherical harmonics of every Gaussian in the direction from the camera."""
+    """Return spherical harmonics of every Gaussian in the direction from the camera."""
     directions = torch.nn.functional.normalize(scene.means - camera.centers, dim=-1)
     return spherical_harmonics.basis(directions, scene.sh_degree)
 

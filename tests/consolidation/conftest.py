@@ -1,4 +1,4 @@
-"""The fixtures of this folder; what tests import by name lies in ball_scenes.py."""
+"""Fixtures of this folder; tests import helpers by name from ball_scenes.py."""
 
 from ball_scenes import relit
 

@@ -57,7 +57,7 @@ def test_what_no_changed_pixel_sees_keeps_its_colours_exactly(relit):
     count = relit.composite.count
     assert torch.equal(out.sh[count:], both.sh[count:])
     assert not torch.equal(out.sh[:count], both.sh[:count])
-    # away from the changed square and the splats that reach into it, the picture stays
+    # far from the changed square and the splats that reach into it, the picture stays
     after = render(out, relit.cameras).color
     assert float((after - before)[:, :4].abs().max()) < 2 / 255
 
@@ -71,7 +71,7 @@ def test_pixels_of_no_weight_have_no_influence(relit):
     options = replace(PLAIN, unchanged_below=0.0)
     clean = consolidate(relit.composite, relit.cameras, relit.images, options, weights=weights)
     masked = consolidate(relit.composite, relit.cameras, spoilt, options, weights=weights)
-    # SSIM-free losses see the render itself in place of untrusted pixels, so the two runs see the same numbers
+    # losses without SSIM see the render itself in place of untrusted pixels, so the two runs see the same numbers
     assert torch.equal(clean.sh, masked.sh)
 
 
@@ -151,8 +151,8 @@ print(peak_memory_bytes())
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory over a stretch is read from /proc")
 def test_memory_does_not_grow_with_the_number_of_views():
-    # glibc gives every freed block of 256 KB or more back at once. Left to itself it keeps freed blocks in its heaps,
-    # and what it cannot use again adds 5 to 40 MB to a run, at random.
+    # glibc gives every freed block of 256 KB or more back at once. By default it keeps freed blocks in its heaps;
+    # the unusable part of these adds 5 to 40 MB to a run, at random.
     environment = {**os.environ, "MALLOC_MMAP_THRESHOLD_": str(2**18)}
 
     def peak(views: int, cache_bytes: int) -> int:
@@ -161,5 +161,5 @@ def test_memory_does_not_grow_with_the_number_of_views():
 
     few = peak(8, 8 * 2**20)
     assert peak(32, 8 * 2**20) - few < 12 * 2**20
-    # the measure sees views that are kept: 24 of them, with 1.2 MB of image each
+    # the measure counts the views that are kept: 24 of them, with 1.2 MB of image each
     assert peak(32, 2**30) - few > 20 * 2**20

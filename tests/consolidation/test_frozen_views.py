@@ -1,4 +1,4 @@
-"""Frozen views: equal to the renderer, cropped cameras, transposes, the cache, restriction to what changed."""
+"""Frozen views: equal to the renderer, cropped cameras, transposes, the cache, restriction to changed pixels."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def test_a_cropped_camera_sees_a_cut_of_the_picture():
 def test_the_budget_bounds_what_is_kept():
     scene, cameras = ball(300, degree=2, seed=3), ring(6, 40)
     one = views_of(scene, cameras, BLACK)[0].own_bytes
-    assert one > 40 * 40 * 4  # the opacity of every pixel alone
+    assert one > 40 * 40 * 4  # opacity of every pixel
     views = views_of(scene, cameras, BLACK, cache_bytes=int(2.5 * one))
     kept = [views[index] is views[index] for index in range(6)]
     assert 1 <= sum(kept) <= 3

@@ -8,13 +8,13 @@ from splatgraft.consolidation.view_errors import ViewError, no_view_error, refin
 
 
 def texture(height: int = 96, width: int = 128, seed: int = 0) -> torch.Tensor:
-    """Smooth blobs of about 8 px in [0.2, 0.8], so that bicubic sampling is accurate."""
+    """Return smooth blobs of about 8 px in [0.2, 0.8], so that bicubic sampling is accurate."""
     noise = torch.rand(1, 3, height // 8, width // 8, generator=torch.Generator().manual_seed(seed))
     return 0.2 + 0.6 * F.interpolate(noise, (height, width), mode="bicubic")[0].permute(1, 2, 0).clamp(0, 1)
 
 
 def spoilt_by(view_error: ViewError, image: torch.Tensor) -> torch.Tensor:
-    """An image whose correction by `view_error` is about `image`: small flows are nearly their own inverse, negated."""
+    """Return an image whose correction by `view_error` is about `image`: a negated small flow is nearly its inverse."""
     return ViewError(flow=-view_error.flow, log_gain=-view_error.log_gain).correct(image)
 
 
@@ -29,7 +29,7 @@ def test_a_known_tint_and_flow_are_found():
     image = texture()
     generator = torch.Generator().manual_seed(1)
     clean = no_view_error(image)
-    # constant over the picture, plus a little that varies
+    # constant over the picture, plus a small variation
     flow = torch.tensor([0.6, -0.4]) + 0.1 * torch.randn(clean.flow.shape, generator=generator)
     gain = torch.tensor([0.06, -0.04, 0.0]) + 0.01 * torch.randn(clean.log_gain.shape, generator=generator)
     true = ViewError(flow=flow, log_gain=gain)
@@ -37,7 +37,7 @@ def test_a_known_tint_and_flow_are_found():
     found = clean
     for _ in range(4):
         found = refine(found, spoilt, image, None)
-    # the ridge shrinks, and knots share pixels: a third of the size, which is far from not finding it
+    # the ridge shrinks, and knots share pixels: a tolerance of a third of the size, far below a missed error
     assert float((found.flow - flow).abs().mean()) < 0.17
     assert float((found.log_gain - gain).abs().mean()) < 0.02
     error = lambda picture: float((picture - image).abs().mean())  # noqa: E731
@@ -49,7 +49,7 @@ def test_untrusted_pixels_do_not_pull():
     spoilt, weight = image.clone(), torch.ones(96, 128)
     spoilt[:, 64:], weight[:, 64:] = 0.9, 0.0
     found = refine(no_view_error(image), spoilt, image, weight)
-    # right of column 64 the picture is ruined; knots that share no cell with it see no difference, but for the coupling
+    # right of column 64 the picture is ruined; knots that share no cell with it see no difference, except by coupling
     # of neighbours through their overlaps, which falls by about 4 from knot to knot: 2 px / 4^3 at most
     assert float(found.flow[:, 0].abs().max()) < 2 / 4**3
 

@@ -1,4 +1,4 @@
-"""Photos on their side are noticed from the poses alone, and turning them changes nothing of what they show."""
+"""Photos on their side are noticed from the poses alone, and turning them does not change their content."""
 
 import math
 
@@ -15,7 +15,7 @@ COUNT = 24
 
 
 def around(last_deg: float = 345.0, height: float = 0.9, roll_deg: float = 4.0) -> Cameras:
-    """Cameras held by hand on a circle, which look at its middle."""
+    """Return hand-held cameras on a circle that look at its middle."""
     generator = torch.Generator().manual_seed(1)
     angles = torch.linspace(0, math.radians(last_deg), COUNT)
     eyes = torch.stack([2 * angles.cos(), 2 * angles.sin(), height + 0.3 * torch.rand(COUNT, generator=generator)], 1)
@@ -48,9 +48,9 @@ def test_single_photos_are_turned_by_the_others_and_what_is_not_clear_stays() ->
     cameras, odd = around(last_deg=150), torch.zeros(COUNT, dtype=torch.long)
     odd[3], odd[7], odd[15] = 1, 2, 3
     assert quarter_turns(cameras.turned(odd).world_from_camera).tolist() == (-odd % 4).tolist()
-    # from straight above there is no upright
+    # cameras straight above define no upright
     above = around(height=9.0).turned(odd)
     assert quarter_turns(above.world_from_camera).tolist() == [0] * COUNT
-    # a short arc may be one of photos that were taken upright along a wall
+    # a short arc may consist of photos that were taken upright along a wall
     lying = around(last_deg=40).turned(torch.ones(COUNT, dtype=torch.long))
     assert quarter_turns(lying.world_from_camera).tolist() == [0] * COUNT

@@ -1,4 +1,4 @@
-"""Contact: a thick floor does not cover the foot of what stands on it, and everything else keeps every bit."""
+"""Contact: a thick floor does not cover the foot of an object on it, and everything else keeps every bit."""
 
 from dataclasses import fields, replace
 
@@ -19,18 +19,17 @@ RADIUS = 0.3
 NOISE = 0.03
 """Standard deviation of the heights of the floor's centres."""
 THICKNESS = 0.02
-"""Standard deviation of each along the normal."""
+"""Standard deviation of each Gaussian along the normal."""
 
 
 def ball(height=0.0, center=(0.0, 0.0)) -> Gaussians:
-    """A ball whose lowest point is `height` over the floor."""
+    """Return a ball with its lowest point `height` over the floor."""
     around = even_directions(4000)
     return surfels(RADIUS * around + torch.tensor([*center, RADIUS + height]), around, width=0.01)
 
 
 def box() -> Gaussians:
-    """The four walls of a box of half width 0.2 and height 0.4 on the floor, seen by all cameras as a capture shows it:
-    without the bottom."""
+    """Return a box's four walls, half width 0.2, height 0.4, on the floor. Like a captured box it has no bottom."""
     along, up = torch.meshgrid(torch.linspace(-0.2, 0.2, 41), torch.linspace(0.005, 0.4, 40), indexing="ij")
     walls = []
     for turn in range(4):
@@ -41,7 +40,7 @@ def box() -> Gaussians:
 
 
 def floor(half=2.0, count=160) -> Gaussians:
-    """A thick, noisy floor in the plane z = 0."""
+    """Return a thick, noisy floor in the plane z = 0."""
     x = torch.linspace(-half, half, count)
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
     z = NOISE * torch.randn(len(grid), 1, generator=torch.Generator().manual_seed(0))
@@ -49,7 +48,7 @@ def floor(half=2.0, count=160) -> Gaussians:
 
 
 def wall() -> Gaussians:
-    """A wall of the same kind in the plane x = -0.4, 0.1 away from the ball."""
+    """Return a wall of the same kind in the plane x = -0.4, 0.1 away from the ball."""
     turn = rotation_about(torch.tensor([0.0, 1.0, 0.0]), torch.pi / 2)
     return Similarity(1.0, turn, torch.tensor([-0.4, 0.0, 0.0])).gaussians(floor())
 
@@ -59,7 +58,7 @@ def same_bits(one, other):
 
 
 def shown(thing, target) -> tuple[torch.Tensor, torch.Tensor]:
-    """Share of each pixel from 15 degrees above the floor that an object makes up, in a composite and alone."""
+    """Return the object's share of each pixel from 15 degrees above the floor, in a composite and alone."""
     placed = (PlacedObject(thing, Similarity.identity()),)
     scene, is_object = Composite(target, placed, torch.zeros(target.count, dtype=torch.bool)).bake()
     eye, middle = torch.tensor([[2.9, 0.0, 0.8]]), torch.tensor([0.0, 0.0, 0.1])
@@ -73,10 +72,10 @@ def test_the_foot_on_a_thick_floor_is_seen_from_the_side_as_without_a_floor(thin
     inside, alone = shown(thing(), floor())
     middle = slice(56, 72)
     hidden = (alone - inside).sum(0)[middle]
-    # of 100 px per unit, three deviations of heights are 0.11, flattened to a fifth 2 px; two widths of the Gaussians
+    # 100 px per unit: three deviations of heights are 0.11, flattened to a fifth 2 px; two widths of the Gaussians
     # in the plane are 0.06, at 15 degrees 1.6 px. Not flattened, the floor hides 9 px of the box.
     assert float(hidden.max()) < 3.6
-    # above that nothing is hidden
+    # nothing is hidden above that
     assert float((alone - inside)[:56, middle].max()) < 0.01
 
 
@@ -156,7 +155,7 @@ def test_a_book_and_a_cup_on_the_table_beside_the_foot_keep_their_shape():
     both = concatenate([floor(), surfels(top, UP.repeat(len(top), 1), width=0.01)])
     moved = (flatten_contact_layers(both, [ball()]).means - both.means).norm(dim=1)[-len(top) :]
     inner = (top[:, 0] > 0.4) & (top[:, 0] < 0.55) & (top[:, 1].abs() < 0.15)
-    # its edge counts in part, as the floor is next to it
+    # its edge counts in part, because the floor is next to it
     assert float(moved[inner].max()) == 0.0
     turn, up = torch.meshgrid(torch.arange(40) / 40 * 2 * torch.pi, torch.linspace(0, 0.3, 30), indexing="ij")
     outward = torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], -1).reshape(-1, 3)

@@ -16,7 +16,7 @@ LENSES = [
 
 
 def distorted(rays, coefficients):
-    """Brown's model on normalised image coordinates, from its definition."""
+    """Distort normalised image coordinates by Brown's model, from its definition."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = rays[..., 0], rays[..., 1]
     square = x * x + y * y
@@ -35,12 +35,12 @@ def pixel_centers(width, height):
 
 
 def picture(rays):
-    """A smooth picture of directions; |second derivative| at most 100 per unit squared in each axis."""
+    """Return a smooth picture of directions; |second derivative| at most 100 per unit squared in each axis."""
     return 0.5 + 0.25 * np.sin(20 * rays[..., 0]) + 0.25 * np.cos(20 * rays[..., 1] + 1)
 
 
 def through_the_lens(coefficients):
-    """The picture on the distorted camera's grid: each pixel's ray is found by fixed-point iteration."""
+    """Return the picture on the distorted camera's grid; fixed-point iteration finds each pixel's ray."""
     matrix = MATRIX.numpy()
     target = (pixel_centers(WIDTH, HEIGHT) - matrix[:2, 2]) / np.diag(matrix)[:2]
     rays = target.copy()

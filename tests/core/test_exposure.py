@@ -1,4 +1,4 @@
-"""Exposure: cameras' tags in image files, the scale that settings give to pixel values, and what is said of them."""
+"""Exposure: cameras' tags in image files, the scale that settings give to pixel values, and their messages."""
 
 import math
 from pathlib import Path

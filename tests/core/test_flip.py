@@ -1,4 +1,4 @@
-"""FLIP against values that the authors' own program gave for the same pictures, its bounds and its symmetry."""
+"""FLIP against values of the authors' own program for the same pictures, its bounds and its symmetry."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,7 @@ RECORDED = json.loads((Path(__file__).with_name("flip_evaluator_1_7.json")).read
 
 
 def picture_pair(kind):
-    """A smooth coloured pattern and a changed copy, 90 x 60 pixels in steps of 1/255."""
+    """Return a smooth coloured pattern and a changed copy, 90 x 60 pixels in steps of 1/255."""
     rows, columns = np.mgrid[0:60, 0:90]
     waves = (np.sin(columns / 7 + rows / 11), np.sin(columns / 5 - rows / 9), np.cos((columns + rows) / 13))
     first = 0.5 + 0.4 * np.stack(waves, -1)

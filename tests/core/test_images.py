@@ -1,4 +1,4 @@
-"""Image files in all modes that cameras and tools write, the sRGB transfer function, resampling."""
+"""Image files in all modes of cameras and tools, the sRGB transfer function, resampling."""
 
 import resource
 import struct
@@ -59,7 +59,7 @@ def test_exif_turns_the_picture_but_not_the_stored_grid(tmp_path, orientation):
     exif[0x0112] = orientation
     Image.fromarray(PIXELS).save(tmp_path / "a.png", exif=exif)
     stored = torch.from_numpy(PIXELS).float() / 255
-    # the tag names where row 0 and column 0 are seen: EXIF 2.3, table of tag 274
+    # the tag names the sides of row 0 and column 0: EXIF 2.3, table of tag 274
     seen = {
         1: stored,
         2: stored.flip(1),
@@ -96,7 +96,7 @@ def test_every_mode_reads(tmp_path, mode):
     assert mask.shape == (12, 20)
     if mode not in ("1", "P"):  # these keep fewer values
         expected = torch.from_numpy(PIXELS[..., 0]).float() / 255
-        assert (rgb - expected[..., None]).abs().max() < 1.5 / 255  # a byte of rounding on the way through CMYK or luma
+        assert (rgb - expected[..., None]).abs().max() < 1.5 / 255  # rounding of one byte by CMYK or luma
         assert (mask - expected).abs().max() < 1.5 / 255
 
 

@@ -70,7 +70,7 @@ def test_no_distortion_is_exact(tmp_path):
 
 
 def write_dot(path: Path, orientation: int) -> tuple[float, float]:
-    """A black picture with one white pixel; gives its middle as Pillow shows it upright."""
+    """Write a black picture with one white pixel, and return its middle in the upright picture of Pillow."""
     pixels = np.zeros((STORED[1], STORED[0]), np.uint8)
     pixels[5, 31] = 255
     exif = Image.Exif()

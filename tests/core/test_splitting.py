@@ -1,4 +1,4 @@
-"""Wide Gaussians around an object are split: its foot is seen, the scene looks as it did, what is narrow is kept."""
+"""Wide Gaussians around an object are split: its foot is seen, the scene looks the same, narrow ones are kept."""
 
 from dataclasses import fields, replace
 
@@ -14,7 +14,7 @@ from splatgraft.rendering import render
 
 
 def flat(points, width, rgb):
-    """Discs that lie on the ground."""
+    """Return discs that lie on the ground."""
     return replace(
         surfels(points, UP.repeat(len(points), 1), width=width, srgb=rgb, thickness=0.005),
         opacity_logits=2.5 * torch.ones(len(points)),
@@ -28,7 +28,7 @@ def table(width, step):
 
 
 def post():
-    """An upright post of small balls, 0.3 tall, that stands on the table."""
+    """Return an upright post of small balls, 0.3 tall, on the table."""
     z = torch.linspace(0.02, 0.3, 24)
     angle = torch.arange(12) / 12 * 2 * torch.pi
     ring = torch.stack([0.06 * angle.cos(), 0.06 * angle.sin()], 1)
@@ -53,7 +53,7 @@ def test_the_foot_is_seen_the_table_looks_as_it_did_and_objects_are_kept_to_the_
     fine, still = split_wide_around(whole, is_object, [thing])
     there = alone > 0.9
     hidden, shown = (1 - coverage(*pair)[there].mean() for pair in ((whole, is_object), (fine, still)))
-    # a disc whose centre is nearer than the post covers its foot; of pieces a quarter as wide only a rim remains
+    # a disc with its centre nearer than the post covers its foot; of pieces a quarter as wide only a rim remains
     assert hidden > 0.15
     assert shown < 0.5 * hidden
     assert torch.equal(still, torch.arange(fine.count) >= fine.count - thing.count)

@@ -150,7 +150,7 @@ def test_projection_inverts_unprojection_and_follows_the_world_rays():
 
 
 def shell(center, radius, *, count=1000, scale=0.01, opacity=0.9):
-    """Small opaque Gaussians spread evenly over a sphere."""
+    """Return small opaque Gaussians spread evenly over a sphere."""
     return Gaussians(
         means=even_directions(count) * radius + torch.tensor(center),
         log_scales=torch.full((count, 3), scale).log(),

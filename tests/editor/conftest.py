@@ -1,4 +1,4 @@
-"""The fixtures of this folder; what tests import by name lies in editor_fixtures.py."""
+"""Fixtures of this folder; tests import helpers by name from editor_fixtures.py."""
 
 from editor_fixtures import browser, made, page, project, session, window
 

@@ -1,4 +1,4 @@
-"""Drives `splatgraft edit` in a browser: starts the server, opens windows, and performs a user's actions."""
+"""Driver of `splatgraft edit` in a browser: starts the server, opens windows, and performs a user's actions."""
 
 import io
 import json
@@ -41,7 +41,7 @@ KNOWN_ERRORS = (
 
 
 def browser_path() -> str:
-    """Path of the system's Chromium, else of Playwright's.
+    """Return the path of the system's Chromium, else of Playwright's.
 
     Without any the test fails, or is skipped where SPLATGRAFT_NO_BROWSER gives a reason.
     """
@@ -85,7 +85,7 @@ _WATCH_CLICK = """element => {
   const taken = event => { if (event.composedPath().includes(element)) window.clickTaken = true; };
   document.addEventListener("click", taken, {capture: true, once: true});
 }"""
-"""Records whether the next click of the page reaches an element."""
+"""Script that records whether the next click of the page reaches an element."""
 
 
 class Editor:
@@ -93,7 +93,7 @@ class Editor:
 
     def __init__(self, project: Path, *options: str) -> None:
         """Start the server and wait for its address."""
-        # the next free port is taken where another worker has this one
+        # the next free port is taken if another worker has this one
         words = [sys.executable, "-m", "splatgraft", "edit", str(project), "--port", "18080", *options]
         self.log = project.parent / "server.log"
         with self.log.open("ab") as errors:
@@ -103,13 +103,13 @@ class Editor:
         assert self.url.startswith("http"), self.log.read_text()[-2000:]
 
     def kill(self) -> None:
-        """Kill the process, as a power cut would."""
+        """Kill the process, like a power cut."""
         self.process.kill()
         self.process.wait(HANG_LIMIT)
         self._close()
 
     def end(self) -> int:
-        """Interrupt the process, as Ctrl-C would; returns the exit status."""
+        """Interrupt the process, like Ctrl-C, and return the exit status."""
         self.process.send_signal(signal.SIGINT)
         status = self.process.wait(HANG_LIMIT)
         self._close()
@@ -118,7 +118,7 @@ class Editor:
     def _close(self) -> None:
         assert self.process.stdout is not None
         self.process.stdout.close()
-        # pytest shows it where the test fails
+        # pytest shows it if the test fails
         print(self.log.read_text()[-2000:])
 
 
@@ -138,7 +138,7 @@ class Window:
 
     @staticmethod
     def opened(browser: Any, address: str) -> "Window":
-        """Open a new window on an editor; one that stays empty is loaded again, as a user would.
+        """Open a new window on an editor; one that stays empty is loaded again.
 
         Where connections failed shortly before, Chromium delays the next one, and viser gives it up after a second.
         """
@@ -181,15 +181,15 @@ class Window:
         self.page.get_by_text(text).first.wait_for()
 
     def shows(self, text: str) -> bool:
-        """Whether the page shows a text now."""
+        """Return whether the page shows a text now."""
         return self.page.get_by_text(text).first.is_visible()
 
     def caption(self) -> str:
-        """The caption of the preview."""
+        """Return the caption of the preview."""
         return " ".join(self.page.locator(".sg-caption").all_text_contents())
 
     def shows_job(self) -> bool:
-        """Whether the page shows a running job."""
+        """Return whether the page shows a running job."""
         return self.page.locator(".sg-job").first.is_visible()
 
     # controls
@@ -199,7 +199,7 @@ class Window:
         self.click_on(self.page.get_by_role("button", name=name, exact=True))
 
     def click_on(self, locator: Any) -> None:
-        """Click an element; again where the page replaced it between press and release of the mouse button."""
+        """Click an element, and repeat if the page replaced it between press and release of the mouse button."""
         from playwright.sync_api import Error as PlaywrightError
 
         def attempt() -> None:
@@ -221,25 +221,25 @@ class Window:
         self.act_until(lambda: self.click_on(button), current.is_visible, what=f"the phase {phase}")
 
     def phase_button(self, phase: str) -> Any:
-        """The button of a phase, whatever mark it has."""
+        """Return the button of a phase, whatever its mark."""
         return self.page.get_by_role("button", name=re.compile(rf"^(\S )?{phase}$")).first
 
     def show_more(self) -> None:
-        """Open what the phases do not show at first."""
+        """Open the folder of rare settings."""
         inner = self.page.get_by_text("View", exact=True)
         self.act_until(lambda: self.unfold("More"), inner.is_visible, what="the further controls")
 
     def inputs(self, label: str) -> Any:
-        """All inputs in the row of a label."""
+        """Return all inputs in the row of a label."""
         row = f'//label[normalize-space()="{label}"]/ancestor::div[contains(@class, "mantine-Flex-root")][1]'
         return self.page.locator(f"xpath={row}//input[not(@type='hidden')]")
 
     def field(self, label: str) -> Any:
-        """The last input in the row of a label; of a slider that is its number."""
+        """Return the last input in the row of a label; for a slider that is its number."""
         return self.inputs(label).last
 
     def write(self, label: str, text: str, *, effect: Callable[[], bool] | None = None) -> None:
-        """Type into a field until it shows the text, and until `effect` holds where given."""
+        """Type into a field until it shows the text, and until `effect` holds if given."""
         field = self.field(label)
 
         def attempt() -> None:
@@ -345,7 +345,7 @@ class Window:
         self.act_until(attempt, effect, what=what)
 
     def _gizmo_handle(self) -> tuple[float, float]:
-        """Position of the gizmo's vertical arrow, the bluest place of the canvas, once it stands still."""
+        """Return the position of the gizmo's vertical arrow, the bluest place of the canvas, after it has stopped."""
         places: list[tuple[float, float]] = []
 
         def stands_still() -> bool:
@@ -363,13 +363,13 @@ class Window:
         return places[-1]
 
     def _blue_pixels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of viser's blue for z; the panels have none of it."""
+        """Return rows and columns of viser's blue for z; the panels have none of it."""
         picture = np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")).astype(int)
         rows, columns = (abs(picture - np.array([48, 144, 240])).sum(-1) < 90).nonzero()
         return rows, columns
 
     def unknown_errors(self) -> list[str]:
-        """Errors in the browser's console except those that viser is known to cause."""
+        """Return errors in the browser's console except those that viser is known to cause."""
         return [text for text in self.errors if not any(known in text for known in KNOWN_ERRORS)]
 
     # jobs
@@ -393,12 +393,12 @@ class Window:
 
 
 def jobs_of(project: Path) -> Jobs:
-    """The jobs of a project."""
+    """Return the jobs of a project."""
     return Jobs(project.parent / ".editor")
 
 
 def wait_for_job(project: Path) -> None:
-    """Wait until the job of a project has ended; fails with its log where it was not successful."""
+    """Wait until the job of a project has ended; fail with its log if it was not successful."""
     jobs = jobs_of(project)
     wait_until(lambda: (state := jobs.state()) is not None and not state.live, what="the end of the job")
     state = jobs.state()
@@ -407,12 +407,12 @@ def wait_for_job(project: Path) -> None:
 
 
 def history_of(project: Path) -> dict[str, Any]:
-    """The names of the states in the undo history."""
+    """Return the names of the states in the undo history."""
     return json.loads((project.parent / ".editor" / "history.json").read_text())
 
 
 def state_of(project: Path) -> EditState:
-    """The state in the project's files; the editor writes them one after another, so reading may have to wait."""
+    """Return the state in the project's files; the editor writes them one by one, so reading may have to wait."""
     found: list[EditState] = []
 
     def read() -> bool:

@@ -16,7 +16,7 @@ from splatgraft.editor.session import Session
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes without photographs, and a project with all steps up to `compose`."""
+    """Make two scenes without photographs, and a project with all steps up to `compose`."""
     root = tmp_path_factory.mktemp("scenes")
     assert main(["run", str(scene_project(root)), "--to", "compose"]) == 0
     return root
@@ -24,27 +24,27 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def project(made: Path, tmp_path: Path) -> Path:
-    """project.toml of a copy of that project."""
+    """Return project.toml of a copy of that project."""
     shutil.copytree(made, tmp_path / "copy")
     return tmp_path / "copy" / "project" / "project.toml"
 
 
 @pytest.fixture
 def session(project: Path) -> Session:
-    """That copy, open."""
+    """Return an open session on that copy."""
     return Session(Project(project))
 
 
 @pytest.fixture
 def page(project: Path) -> Iterator[Page]:
-    """The page on that copy, with a real server."""
+    """Return the page on that copy, with a real server."""
     with opened_page(project) as found:
         yield found
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A browser without windows; tests that use it are marked `browser` (tests/conftest.py).
+    """Return a browser without windows; tests that use it are marked `browser` (tests/conftest.py).
 
     It is closed behind each module: Playwright cannot be started twice in one process, and test_exported_page.py has a
     browser of its own.
@@ -57,7 +57,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def window(browser: Any, page: Page) -> Iterator[Any]:
-    """A window on the page."""
+    """Return a window on the page."""
     from editor_driver import Window
 
     opened = Window.opened(browser, address_of(page))
@@ -66,5 +66,5 @@ def window(browser: Any, page: Page) -> Iterator[Any]:
 
 
 def address_of(page: Page) -> str:
-    """The complete address of a page that a test serves."""
+    """Return the complete address of a page that a test serves."""
     return f"http://127.0.0.1:{page.context.guarded.port}/?token=secret"

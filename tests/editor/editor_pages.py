@@ -23,7 +23,7 @@ TOKEN = "secret"
 
 
 def scene_project(root: Path, *, suffix: str = ".ply", target: Gaussians | None = None, **segment: object) -> Path:
-    """Write two scene files and a project of them; returns project.toml. The target is a plane unless it is given."""
+    """Write two scene files and a project of them, and return project.toml. The target is a plane by default."""
     scenes = [concatenate([plane((0.3, 0.5, 0.3)), ball()]), plane((0.5, 0.45, 0.6)) if target is None else target]
     paths = [root / f"{name}{suffix}" for name in ("source", "target")]
     for path, scene in zip(paths, scenes, strict=True):
@@ -43,7 +43,7 @@ def scene_project(root: Path, *, suffix: str = ".ply", target: Gaussians | None 
 
 @contextmanager
 def served() -> Iterator[GuardedServer]:
-    """A server without a page, at a free port."""
+    """Return a server without a page, at a free port."""
     guarded = GuardedServer(TOKEN, host="127.0.0.1", port=0)
     try:
         yield guarded
@@ -53,7 +53,7 @@ def served() -> Iterator[GuardedServer]:
 
 @contextmanager
 def opened_page(project: Path, *, opening: bool = False) -> Iterator[Page]:
-    """The page on a project, which need not exist."""
+    """Return the page on a project, which need not exist."""
     with served() as guarded:
         shown = Opening(guarded.viser, project, project.parent) if opening else None
         page = Page(guarded, Project(project), budget=1000, opening=shown)
@@ -64,7 +64,7 @@ def opened_page(project: Path, *, opening: bool = False) -> Iterator[Page]:
 
 
 def cloud(count: int, seed: int) -> Gaussians:
-    """Random Gaussians of SH degree 1."""
+    """Return random Gaussians of SH degree 1."""
     generator = torch.Generator().manual_seed(seed)
     return Gaussians(
         means=torch.rand(count, 3, generator=generator),
@@ -76,17 +76,17 @@ def cloud(count: int, seed: int) -> Gaussians:
 
 
 def arrives(handle: Any, value: Any) -> None:
-    """What viser does first with a value that a browser sends."""
+    """Convert a value from a browser, as viser does first."""
     handle._impl.value = value
 
 
 def is_handled(handle: Any) -> None:
-    """What viser does next, in another thread."""
+    """Handle a value, as viser does next in another thread."""
     for callback in handle._impl.update_cb:
         callback(GuiEvent(client=None, client_id=0, target=handle))  # pyright: ignore[reportArgumentType]
 
 
 def sends(handle: Any, value: Any) -> None:
-    """A value that a browser sends, handled."""
+    """Send a value like a browser, and handle it."""
     arrives(handle, value)
     is_handled(handle)

@@ -1,4 +1,4 @@
-"""Who may open the page: requests by Host, Origin and token, and which of the windows edits."""
+"""Access to the page: requests by Host, Origin and token, and the window that edits."""
 
 import http.client
 import subprocess
@@ -37,7 +37,7 @@ def test_the_page_s_own_requests_are_accepted_with_the_token() -> None:
         {"Host": "evil.example:8080"},
         {"Host": "evil.example:8080", "Origin": "http://evil.example:8080"},
         {"Host": "evil.example", "X-Forwarded-Host": "127.0.0.1", "X-Forwarded-For": "127.0.0.1"},
-        # repeated headers, as the server joins them
+        # repeated headers, joined like the server does
         {"Host": "127.0.0.1:8080, evil.example"},
         {"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:8080, http://evil.example"},
         {},
@@ -76,7 +76,7 @@ def test_the_server_refuses_what_is_foreign_and_serves_only_shared_files(tmp_pat
             found = connection.getresponse()
             found.read()
             connection.close()
-            # behind each answer the server ends the connection, and a client must not send another request into it
+            # the server ends the connection after each answer, and a client must not send another request into it
             assert found.headers["Connection"] == "close", path
             return found
 

@@ -1,4 +1,4 @@
-"""What no page sends, sent to the editor: refused in one line and in bounded memory, and the page goes on."""
+"""Messages that no page sends are refused in one line and in bounded memory, and the page continues."""
 
 import contextlib
 import http.client
@@ -39,7 +39,7 @@ CAMERA = {
 }
 IDENTITY = [[float(row == column) for column in range(4)] for row in range(4)]
 PART = 1 << 19
-"""Bytes of a part of an upload, as viser's page sends it."""
+"""Size of a part of an upload in viser's page, bytes."""
 
 
 def encode(message: object) -> bytes:
@@ -47,14 +47,14 @@ def encode(message: object) -> bytes:
 
 
 class Client:
-    """A program that knows the token, in place of the page."""
+    """Client that knows the token, instead of the page."""
 
     def __init__(self, port: int, token: str) -> None:
         self.port, self.cookie = port, f"splatgraft_token_{port}={token}"
         self.controls: dict[str, dict[str, Any]] = {}
         """Properties of the page's controls, by their ids."""
         self.said: list[str] = []
-        """Texts of the page, as they came."""
+        """Texts of the page, in order of arrival."""
 
     def get(self, path: str, **headers: str) -> int:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=HANG_LIMIT)
@@ -75,7 +75,7 @@ class Client:
 
     @contextlib.contextmanager
     def window(self) -> Iterator[ClientConnection]:
-        """A window whose page is complete."""
+        """Return a window with a complete page."""
         with self.connect() as window:
             window.send(encode(CAMERA))
             self.wait(window, lambda: "ReplayDoneMessage" in self.said and self._is_complete(), what="the page")
@@ -88,11 +88,11 @@ class Client:
         return any(props.get("label") == "History" for props in self.controls.values())
 
     def wait(self, window: ClientConnection, condition: Callable[[], bool], *, what: str) -> None:
-        """Take what the server sends until the condition holds."""
+        """Read messages of the server until the condition holds."""
         wait_until(condition, what=what, pause=partial(self._listen, window))
 
     def finds(self, window: ClientConnection, path: str, text: str) -> None:
-        """Write a path into a field until the page says this of it; what a window sends before it edits is lost."""
+        """Write a path into a field until the page answers with this text; messages before a window edits are lost."""
         self.said.clear()
         act_until(
             lambda: self.set(window, "Place into", path + " " * random.randrange(1, 99)),
@@ -103,7 +103,7 @@ class Client:
 
     def works(self, window: ClientConnection) -> None:
         """Assert that the page answers to this window."""
-        # another name each time, as a text that stays is not sent again
+        # another name each time, because an unchanged text is not sent again
         self.finds(window, f"nowhere_{random.randrange(1 << 30)}", "found nothing there")
 
     def _listen(self, window: ClientConnection, seconds: float) -> None:
@@ -138,7 +138,7 @@ class Client:
 
 
 def malformed(upload_button: str) -> list[bytes | str]:
-    """Messages that viser cannot decode, and some that no control takes."""
+    """Return messages that viser cannot decode, and some for which no control exists."""
     update = {"type": "GuiUpdateMessage", "uuid": upload_button}
     return [
         os.urandom(1000),
@@ -157,12 +157,12 @@ def send_all(client: Client, messages: list[bytes | str]) -> None:
     for message in messages:
         with contextlib.suppress(ConnectionClosed), client.window() as window:
             window.send(message)
-            # what follows is taken after it, or the window closes
+            # later messages are taken after it, or the window closes
             client.works(window)
 
 
 def stray(log: str) -> list[str]:
-    """Lines of a log other than our own."""
+    """Return lines of a log that are not our own."""
     return [line for line in log.splitlines() if not line.startswith(("splatgraft: expected", "open this address"))]
 
 
@@ -186,14 +186,14 @@ def test_messages_that_no_page_sends_are_a_line_in_the_log(tmp_path: Path, capfd
 
 
 def lying_spz() -> bytes:
-    """A .spz whose header says 10 Gaussians, and half a gigabyte behind them."""
+    """Return a .spz whose header gives 10 Gaussians, followed by half a gigabyte."""
     deflate = zlib.compressobj(9, zlib.DEFLATED, 31)
     head = struct.pack("<IIIBBBB", 0x5053474E, 2, 10, 0, 12, 0, 0)
     return deflate.compress(head) + b"".join(deflate.compress(bytes(1 << 20)) for _ in range(512)) + deflate.flush()
 
 
 def deflated(path: Path, name: str, megabytes: int, method: int = zipfile.ZIP_DEFLATED) -> bytes:
-    """A zip with one file of blanks."""
+    """Return a zip with one file of blanks."""
     with zipfile.ZipFile(path, "w", method) as archive, archive.open(name, "w") as stream:
         for _ in range(megabytes):
             stream.write(b" " * (1 << 20))
@@ -201,7 +201,7 @@ def deflated(path: Path, name: str, megabytes: int, method: int = zipfile.ZIP_DE
 
 
 def huge_png() -> bytes:
-    """A picture of 60,000 x 60,000 pixels by its header."""
+    """Return a picture of 60,000 x 60,000 pixels by its header."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -245,7 +245,7 @@ def test_attacks_of_all_kinds_leave_a_page_that_works(tmp_path: Path) -> None:
 
 
 def closing(window: ClientConnection) -> Close:
-    """What the server says as it closes a window."""
+    """Read until the server closes a window, and return the close."""
     with contextlib.suppress(ConnectionClosed):
         while True:
             window.recv()
@@ -275,7 +275,7 @@ def too_much(client: Client) -> None:
         assert closing(window).code == CloseCode.MESSAGE_TOO_BIG
     send_all(client, malformed(client.control("Upload a video or a scene")))
     with client.window() as window:
-        # what is announced too large is said, and no part of it is kept
+        # an upload announced as too large gives a message, and no part of it is kept
         client.upload(window, "big.ply", bytes(50 * PART), size=2 << 30)
         client.wait(window, lambda: any("at most 1 GiB" in text for text in client.said), what="the limit")
         client.upload(window, "more.ply", bytes(50 * PART), size=PART)
@@ -283,7 +283,7 @@ def too_much(client: Client) -> None:
         for _ in range(200):
             with contextlib.suppress(OSError):
                 many.append(client.connect())
-        # the first goes on while they are there, and those above the limit are told
+        # the first windows continue, and those above the limit get a message
         client.works(window)
         assert "at most 16 windows" in closing(many[-1]).reason
         for one in many:

@@ -30,7 +30,7 @@ def grabbed(session: Session, mode: GrabMode) -> Grab:
 
 
 def pixel(camera: Cameras, point: torch.Tensor) -> np.ndarray:
-    """Where a point is in a view, over its width and height, by numpy alone."""
+    """Return a point's position in a view, over its width and height, by numpy alone."""
     pose = np.linalg.inv(camera.world_from_camera[0].double().numpy())
     seen = camera.intrinsics[0].double().numpy() @ (pose[:3, :3] @ point.double().numpy() + pose[:3, 3])
     return seen[:2] / seen[2] / (camera.width, camera.height)
@@ -49,7 +49,7 @@ def test_a_moved_object_follows_the_pointer_on_its_surface(session: Session) -> 
         assert np.abs(pixel(grab.camera, moved) - pixel(grab.camera, begun) - (dx, dy)).max() < 2 / grab.camera.height
         # the plane's blobs are wider apart than they are thick
         assert abs(float(moved[2] - begun[2])) < 0.08
-    # over what is no surface it keeps its height
+    # outside of any surface it keeps its height
     empty = replace(grab, depth=np.full_like(grab.depth, np.inf))
     assert abs(float(foot(empty, empty.at((0.55, 0.55)))[2] - begun[2])) < 1e-4
     assert torch.equal(grab.at((0.5, 0.4)).rotation, grab.placed.rotation)
@@ -63,7 +63,7 @@ def test_a_lifted_turned_and_sized_object_keeps_its_foot_or_its_place(session: S
     turn = grabbed(session, "turn")
     turned = turn.at((0.75, 0.2))
     assert torch.allclose(foot(turn, turned), begun, atol=1e-4)
-    # a quarter of the width is a quarter of a turn; what is in front goes with the pointer, to the right
+    # a quarter of the width is a quarter of a turn; the front follows the pointer to the right
     quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     assert torch.allclose(turned.rotation, quarter @ turn.placed.rotation, atol=1e-2)
     size = grabbed(session, "size")
@@ -92,7 +92,7 @@ def test_a_dragged_object_is_hidden_by_what_is_before_it(session: Session) -> No
 
 
 def test_the_picture_of_the_sky_shows_lights_where_they_are() -> None:
-    # the viewer looks along +y: what is on the left is -x
+    # the viewer looks along +y, so -x is on the left
     dome = SkyDome.seen_along(torch.tensor([0.0, 1.0, -0.3]), UP)
     for direction in ((0.0, 0.6, 0.8), (0.6, 0.0, 0.8), (-0.48, -0.64, 0.6)):
         x, y = dome.point(torch.tensor(direction))

@@ -88,7 +88,7 @@ def test_the_remaining_time_is_measured_or_not_said() -> None:
     plan = (PlannedStep("a", 10.0, True), PlannedStep("b", 4.0, True), PlannedStep("c", 6.0, True))
     state = JobState("work", (), 1, "running", 0.0, step="a", step_started=100.0, plan=plan)
     assert seconds_left_in_job(state, 103.0) == 7.0 + 4.0 + 6.0
-    # the rate of the running step counts where it is slower than in the last run
+    # the rate of the running step counts if it is slower than in the last run
     assert seconds_left_in_job(replace(state, done=1, total=4, begun_at=100.0), 105.0) == 15.0 + 4.0 + 6.0
     # the counter may be one of several of the step
     assert seconds_left_in_job(replace(state, done=3, total=4, begun_at=100.0), 103.0) == 7.0 + 4.0 + 6.0
@@ -116,7 +116,7 @@ def test_a_state_is_read_back_as_written_and_a_damaged_one_does_not_prevent_anot
     for text in ("{", "7", '{"pid": 0}', json.dumps(JobState("a", (), 0, "running", 0.0).__dict__)):
         (tmp_path / "job.json").write_text(text)
         assert jobs.state() is None
-    # a process that ends before it says anything counts as killed
+    # a process that ends without a message counts as killed
     jobs.start(["true"], title="next", shown=())
     state = jobs.state()
     assert state is not None
@@ -128,14 +128,14 @@ def test_a_state_is_read_back_as_written_and_a_damaged_one_does_not_prevent_anot
 
 @pytest.fixture
 def result(tmp_path: Path) -> Session:
-    """A project in which all was run."""
+    """Return a project after a run of all steps."""
     root = write_transfer(tmp_path)
     (root / "project.toml").write_text('[source]\ncapture = "photos"\n[target]\ncapture = "photos"\n')
     return Session(Project(root / "project.toml"))
 
 
 def written(session: Session, kind: str, part: str) -> tuple[Path, JobState]:
-    """What a job's process does, in this one."""
+    """Do the work of a job's process in this one."""
     shared, layer = sharing.SHARE_KINDS[kind], sharing.PARTS[part]
     to = sharing.export_path(session.files, shared, layer)
     to.parent.mkdir(parents=True, exist_ok=True)
@@ -158,7 +158,7 @@ def test_a_job_writes_what_the_command_writes(result: Session, tmp_path: Path) -
     assert main([*job.command[:3], str(tmp_path / "b.sog"), *job.command[4:]]) == 0
     assert to.read_bytes() == (tmp_path / "b.sog").read_bytes()
     assert job.command[4:] == ("--layer", "object-with-shadow")
-    # what was assumed, then size and time
+    # assumptions first, then size and time
     assert "black over what lies behind" in job.said[0]
     assert job.said[-1].startswith(f"{to}: 0.0 MB in ")
     assert sharing.written_exports(result.files) == (to,)
@@ -178,7 +178,7 @@ def test_missing_results_and_packages_are_said(result: Session, monkeypatch: pyt
     page, report = (sharing.SHARE_KINDS[name] for name in ("Page to look at (.html)", "Report as one page (.html)"))
     assert "no report yet" in (sharing.why_not(result.files, report) or "")
     result.files.result.unlink()
-    # the light transfer alone can be shared before anything is consolidated
+    # the light transfer alone can be shared before consolidation
     assert sharing.step_shown(result.files, is_report=False) == "relight"
     assert sharing.why_not(result.files, page) is None
     result.files.relit.unlink()

@@ -1,4 +1,4 @@
-"""The phase Open: what a path is before anything is made of it, and how scenes are viewed."""
+"""The phase Open: the kind of a path before any work, and the views of scenes."""
 
 import shutil
 import zipfile

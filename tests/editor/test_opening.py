@@ -1,4 +1,4 @@
-"""A large scene opens as points of a sample of it, read without torch; input does not wait for the whole scene."""
+"""A large scene opens as points of a sample, read without torch; input does not wait for the whole scene."""
 
 import threading
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ from splatgraft.editor.state_files import read_state
 from splatgraft.formats import read_gaussians, write_cameras, write_gaussians
 
 MOST = 60
-"""Gaussians of the sample; the target has 144."""
+"""Number of Gaussians in the sample; the target has 144."""
 
 
 def test_a_sample_is_solid_rows_of_the_file(tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_the_first_view_is_through_the_first_camera(tmp_path: Path) -> None:
     write_cameras(tmp_path / "transforms.json", cameras)
     view = read_first_view(tmp_path / "transforms.json")
     assert view is not None
-    # what float32 holds of numbers near 3
+    # precision of float32 for numbers near 3
     assert np.allclose(view.world_from_camera, cameras.world_from_camera[0], atol=1e-6)
     assert view.half_height == pytest.approx(100 / float(cameras.intrinsics[0, 1, 1]))
     assert view.aspect == pytest.approx(1.6)
@@ -79,7 +79,7 @@ def test_the_first_view_is_through_the_first_camera(tmp_path: Path) -> None:
 
 
 class Opened:
-    """A server in front of a project whose target takes as long to read as the test wants."""
+    """Server in front of a project whose target takes a chosen time to read."""
 
     def __init__(self, project: Path, guarded: GuardedServer) -> None:
         self.may_be_read = threading.Event()
@@ -125,7 +125,7 @@ def opened(project: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Opened]:
 
 
 def test_a_sample_comes_first_and_input_does_not_wait_for_the_rest(opened: Opened) -> None:
-    # before the page is there
+    # before the page is complete
     wait_until(lambda: opened.sees("PointCloudMessage", "/coarse"), what="the sample")
     wait_until(lambda: opened.sees("SetCameraPositionMessage"), what="the view of the first camera")
     page = opened.open_page()

@@ -31,7 +31,7 @@ def phase_of(page: Page, name: str) -> Any:
 
 
 def mark_of(page: Page, phase: str) -> str:
-    """What stands before the name of a phase."""
+    """Return the mark before the name of a phase."""
     return next(option for option in page._phase_buttons.options if option.endswith(phase)).partition(" ")[0]
 
 
@@ -39,7 +39,7 @@ def status(page: Page) -> str:
     return page.context.status.content
 
 
-# numbers that are typed
+# typed numbers
 
 
 def test_a_refresh_leaves_a_typed_box_alone(page: Page) -> None:
@@ -51,7 +51,7 @@ def test_a_refresh_leaves_a_typed_box_alone(page: Page) -> None:
     assert lower.value == (-0.3, -0.35, 0.03)
     is_handled(lower)
     assert read_state(session.files.file).box == (-0.3, -0.35, 0.03, 0.35, 0.35, 0.65)
-    # what cannot be is refused, and the fields show again what is
+    # impossible values are refused, and the fields show the present ones again
     sends(lower, (9.0, -0.35, 0.03))
     assert lower.value == (-0.3, -0.35, 0.03)
     session.change(replace(session.state, box=(-0.2, -0.2, 0.0, 0.2, 0.2, 0.5)))
@@ -84,7 +84,7 @@ def test_the_object_s_height_is_shown_and_typed_in_centimetres(page: Page) -> No
     place, session = phase_of(page, "Place"), page.context.require_session()
     size, before = place._size, session.objects()[0].target_from_object
     base = session.placeable_object(0).base
-    # without scales it says how to get them
+    # without scales the page says how to get them
     assert not size._height.visible
     assert "what the project says: 0.8 times" in size._note.content
     sends(place._scale, 1.0)
@@ -106,7 +106,7 @@ def test_the_object_s_height_is_shown_and_typed_in_centimetres(page: Page) -> No
     assert size._height.visible
     assert size._height.value == pytest.approx(12.0)
     assert session.objects()[0].target_from_object.scale == before.scale
-    # a typed height changes the scale, and the foot stays where it is
+    # a typed height changes the scale, and the foot stays
     arrives(size._height, 18.0)
     page.refresh()
     assert size._height.value == 18.0
@@ -149,7 +149,7 @@ def test_the_strength_of_a_source_stays_as_it_was_set(page: Page) -> None:
     assert light._strength.value == 3
     assert session.state.light is not None
     assert session.state.light.sources[0].irradiance == pytest.approx((6.0, 6.0, 6.0))
-    # of what it was, not of what it is; nor is a dark source lost
+    # relative to the earlier source, not to the present one; a dark source is not lost either
     sends(light._strength, 0.0)
     sends(light._strength, 0.5)
     assert session.state.light.sources[0].irradiance == pytest.approx((1.0, 1.0, 1.0))
@@ -168,7 +168,7 @@ def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(page: Page) -> N
     assert {key: slider.value for key, slider in sliders.items()} == asdict(LayerWeights())
     relit = session.relighting.relit(session.placed_state())
     before = session.relighting.scene(session.placed_state())
-    # one plane tells little of the light: what is known of it is said
+    # one plane shows little of the light, and the page says so
     page.refresh()
     assert (relit.report[0].text if relit.light is None else "Estimated: ") in html.unescape(light._text.content)
     for key, value in (("exposure", 1.0), ("tint", 0.5), ("shadow", 0.25)):
@@ -180,7 +180,7 @@ def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(page: Page) -> N
     objects = relit.bake()[1]
     assert after.count == before.count
     assert float((after.sh - before.sh)[objects, 0].mean()) > 0.1
-    # what is as computed needs no key in project.toml
+    # a computed value needs no key in project.toml
     for key, value in asdict(LayerWeights()).items():
         sends(sliders[key], value)
     assert "exposure" not in session.files.file.read_text()
@@ -191,7 +191,7 @@ def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(page: Page) -> N
 
 
 def drag(handler: Any, handle: Any, *, position: Any = None, wxyz: Any = None) -> None:
-    """What viser does when a browser drags a handle and releases it."""
+    """Drag a handle and release it, as viser does for a browser."""
     for phase in ("start", "update", "end"):
         if phase != "start" and position is not None:
             handle.position = np.asarray(position, dtype=float)
@@ -202,7 +202,7 @@ def drag(handler: Any, handle: Any, *, position: Any = None, wxyz: Any = None) -
 
 def test_drags_move_turn_and_scale_with_and_without_snapping(page: Page) -> None:
     place, session = phase_of(page, "Place"), page.context.require_session()
-    # the pointer drags the object itself until the handles are wanted
+    # the pointer drags the object itself unless the handles are shown
     assert place._gizmo._move is None
     sends(place._has_gizmo, True)
     gizmo, foot = place._gizmo, session.placeable_object(0).base.point
@@ -226,13 +226,13 @@ def test_drags_move_turn_and_scale_with_and_without_snapping(page: Page) -> None
     drag(gizmo._scaled, gizmo._scale, position=stands.numpy() + 2 * (top - stands.numpy()))
     assert placed().scale == pytest.approx(2 * before.scale, rel=1e-4)
     assert torch.allclose(placed().points(foot), stands, atol=1e-4)
-    # below the ground a smallest size is left
+    # a minimum size remains below the ground
     drag(gizmo._scaled, gizmo._scale, position=stands.numpy() - np.array([0, 0, 5.0]))
     assert placed().scale == pytest.approx(0.04 * before.scale, rel=1e-3)
     for _ in range(2):
         assert session.undo()
     page.refresh()
-    # a quarter above the ground, turned by 20 degrees: as it is without snapping, on the ground and by 15 with it
+    # a quarter above the ground, turned by 20 degrees: free without snapping; on the ground and by 15 degrees with it
     half = np.radians(20.0) / 2
     moved = {"position": stands.numpy() + np.array([0.1, 0, 0.12]), "wxyz": (np.cos(half), 0, 0, np.sin(half))}
     drag(gizmo._moved, gizmo._move, **moved)
@@ -248,7 +248,7 @@ def test_drags_move_turn_and_scale_with_and_without_snapping(page: Page) -> None
     # one step of undo per drag
     assert session.undo()
     assert torch.allclose(session.objects()[0].target_from_object.translation, before.translation, atol=1e-5)
-    # numbers that cannot be are refused, and the project opens
+    # impossible numbers are refused, and the project opens
     drag(gizmo._moved, gizmo._move, position=(np.nan, 0, 0))
     assert "expected a number" in status(page)
     read_state(session.files.file)
@@ -300,7 +300,7 @@ def test_erased_flags_of_another_target_leave_the_page_usable(project: Path) -> 
         assert read_state(project).erased is None
 
 
-# project files that cannot be read
+# unreadable project files
 
 
 BAD_TABLES = [
@@ -374,7 +374,7 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
         assert "out of date: you moved the object" in share._stale.content
         phase_of(page, "Run")
         assert "out of date: you moved the object" in run._note.content
-        # back at the edits, the picture is theirs
+        # after undoing, the picture belongs to the edits again
         page.show_phase("Place")
         assert page.preview._right.value == "Light transfer"
 

@@ -1,4 +1,4 @@
-"""What only a browser shows: canvas, gizmos, strokes, photos, sizes of windows; and the whole way to the result."""
+"""The page in a browser: canvas, gizmos, strokes, photos, sizes of windows; and the whole way to the result."""
 
 import io
 import math
@@ -43,7 +43,7 @@ DRAFT = "a draft of the light"
 
 
 def with_given_light(project: Path) -> Path:
-    """Surroundings of one plane are too little to estimate a light from."""
+    """Give the project a light, because surroundings of one plane show too little of it."""
     (project.parent / "light.json").write_text(light_to_json(LIGHT))
     project.write_text(with_keys(project.read_text(), "relight", {"given_light": "light.json"}))
     return project
@@ -63,7 +63,7 @@ def canvas_of(window: Window) -> np.ndarray:
 
 
 def difference(window: Window, picture: np.ndarray) -> float:
-    """Median difference of the lower half of the canvas from a picture: notifications and gizmos are above."""
+    """Return the median difference of the canvas's lower half from a picture; notifications and gizmos are above."""
     shown = canvas_of(window)
     wanted = np.asarray(Image.fromarray(picture).resize((shown.shape[1], shown.shape[0]))).astype(float)
     return float(np.median(abs(shown - wanted)[shown.shape[0] // 2 : -60]))
@@ -129,7 +129,7 @@ def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window
     window.show_more()
     window.check("Show the cameras")
     window.until(lambda: of_cameras() > before + 500, what="cameras in view")
-    # a second window is told that it only watches, and edits when the first one is closed
+    # a second window gets the message that it only watches, and edits after the first one is closed
     other = Window.opened(window.page.context, address_of(page))
     notice = "another window edits this project"
     other.says(notice)
@@ -140,7 +140,7 @@ def test_the_canvas_is_the_renderer_s_picture_when_the_view_rests(window: Window
     other.page.get_by_text(notice).wait_for(state="detached")
     other.show_phase("Run")
     other.says("There is no result yet")
-    # a picture that is drawn late for the closed window leaves the script of the other one what it is told
+    # a picture drawn late for the closed window does not change the state of the other window's script
     page.preview._tell(closed, [], None, ())
     other.show_phase("Place")
     other.until(lambda: bool(told(other)["hulls"]), what="the outline of the object")
@@ -201,7 +201,7 @@ def test_an_arrow_of_the_light_is_dragged_under_drafts(browser: Any, project: Pa
 
 
 def click_at(window: Window, page: Page, point: torch.Tensor) -> None:
-    """Click where the canvas shows a point of the scene."""
+    """Click on a point of the scene in the canvas."""
     canvas, client = window.page.locator("canvas").first.bounding_box(), page.context.guarded.editing()
     assert client is not None
     camera = camera_from_viser(client.camera, width=round(canvas["width"]))
@@ -212,7 +212,7 @@ def click_at(window: Window, page: Page, point: torch.Tensor) -> None:
 
 
 def set_the_sun(window: Window, page: Page, pairs: Sequence[tuple[torch.Tensor, torch.Tensor]]) -> LightSource:
-    """Set the sun by clicks on points and their shadows; gives it as it is saved."""
+    """Set the sun by clicks on points and their shadows, and return it as saved."""
     window.show_phase("Light")
     wait_for_the_full_light(window)
     window.check("Set the sun by two clicks")
@@ -283,7 +283,7 @@ def test_two_clicks_on_the_demo_s_table_give_its_known_sun_and_a_shadow_as_dark_
 
 def test_strokes_and_clicks_in_a_photo_select_the_object(window: Window, project: Path) -> None:
     def strokes() -> tuple[int, int]:
-        """How many Gaussians were added and removed."""
+        """Return the numbers of added and removed Gaussians."""
         found = state_of(project).corrections
         return (0, 0) if found is None else (int((found > 0).sum()), int((found < 0).sum()))
 
@@ -310,7 +310,7 @@ def test_strokes_and_clicks_in_a_photo_select_the_object(window: Window, project
     window.show_more()
     window.check("Second box")
     window.click("Add")
-    # the box begins a tenth larger than the object's, and adds what was removed in it
+    # the box begins a tenth larger than the object's, and adds the removed Gaussians in it
     window.until(lambda: strokes()[0] >= 80, what="corrections by the box")
     window.undo_until(project, lambda: strokes() == (0, 0))
     window.check("Second box", False)
@@ -364,7 +364,7 @@ def click_into_a_photo(window: Window, project: Path) -> None:
 
 
 def told(window: Window) -> dict[str, Any]:
-    """What the page's script was told with the picture, once that is there with the one before."""
+    """Wait for the picture and the one before it, and return the state of the page's script."""
     window.page.locator(".sg-line").wait_for(state="visible")
     return window.page.evaluate("JSON.parse(document.querySelector('.sg-state').textContent)")
 
@@ -388,7 +388,7 @@ def test_hands_move_turn_size_and_lift_the_object(window: Window, page: Page) ->
         return window.page.evaluate("document.querySelector('.sg-state').dataset.version")
 
     def hand(key: str | None, by: tuple[float, float]) -> Any:
-        """Drag the object, and wait until it is placed and seen there; gives the placement before."""
+        """Drag the object, wait until it is placed and visible there, and return the earlier placement."""
         before, start, shown = placed(), middle_of_the_object(window), version()
         if key is not None:
             window.page.keyboard.press(key)
@@ -423,7 +423,7 @@ def test_hands_move_turn_size_and_lift_the_object(window: Window, page: Page) ->
     window.page.keyboard.press("ArrowRight")
     window.until(lambda: placed() is not before, what="a step to the right")
     assert 0.001 < float((placed().translation - before.translation).norm()) < 0.1
-    # another window's number, and what is no number, change nothing
+    # another window's number and text without a number change nothing
     wait_for_the_full_light(window)
     before, ours = placed(), told(window)["window"]
     base, get = window.page.url.partition("?")[0].rstrip("/"), window.page.request.get
@@ -492,7 +492,7 @@ def test_controls_fit_and_the_scene_is_seen_at_the_sizes_of_a_desktop_a_laptop_a
             assert boxes[0]["x"] >= 0
             assert boxes[-1]["x"] + boxes[-1]["width"] <= width
             assert page.evaluate("document.documentElement.scrollWidth") <= width
-            # what a field shows is not cut
+            # a field's text is not cut
             cut = page.evaluate(
                 "Array.from(document.querySelectorAll('input[inputmode]')).filter("
                 "e => e.offsetParent && e.scrollWidth > e.clientWidth + 1).map(e => e.value)"
@@ -526,7 +526,7 @@ TEXTS = ("0", "-1", "1e9", "1e30", "nan", "", "0.5", "-", "../../..", "/dev/null
 
 
 def act(window: Window, random_: random.Random) -> None:
-    """One random action of a user."""
+    """Do one random action of a user."""
     page, kind = window.page, random_.randrange(8)
     x, y = random_.uniform(5, 1275), random_.uniform(5, 895)
     if kind == 0:
@@ -537,7 +537,7 @@ def act(window: Window, random_: random.Random) -> None:
     elif kind == 2:
         page.keyboard.press(random_.choice(KEYS))
     elif kind == 3:
-        # the panel is where most can go wrong
+        # most errors can occur in the panel
         random_.choice(page.get_by_role("button").all()).click(timeout=1000)
     elif kind == 4:
         field = random_.choice(page.locator("input:not([type=hidden]):not([type=file])").all())
@@ -588,7 +588,7 @@ def test_random_actions_leave_a_project_that_opens(
         child.wait()
     if project.is_file():
         session = Session(Project(project))
-        # nothing that was decided is lost
+        # no decision is lost
         if (last := page.context.session) is not None:
             assert history_of(project)["present"] == last.history.present
         while session.undo():
@@ -629,7 +629,7 @@ def test_the_whole_way_from_photos_to_the_shared_page_by_hand(browser: Any, tmp_
         # the page says that it has no editor any more, and does not call its state saved
         window.page.locator("#sg-dead").wait_for(state="visible")
         assert not window.page.locator(".sg-saved").is_visible()
-        # else it would connect to the next editor at this port
+        # otherwise it would connect to the next editor at this port
         window.page.close()
     finally:
         if editor.process.poll() is None:
@@ -641,7 +641,7 @@ def open_scenes(window: Window, browser: Any, editor: Editor, root: Path) -> Win
     window.write("Object from", str(root / "nowhere"))
     window.upload("Upload a video or a scene", root / "target.ply")
     window.says("target.ply: stored as")
-    # it says what a path is before anything is made of it
+    # it names the kind of a path before any work
     window.says("expected photos, a video, a posed capture or a scene, found nothing there")
     assert window.page.get_by_role("button", name="Start the project").is_disabled()
     window.write("Object from", str(root / "photos"))
@@ -724,7 +724,7 @@ def place(window: Window, browser: Any, editor: Editor, project: Path) -> Window
 
 def light(window: Window, project: Path) -> None:
     window.show_phase("Light")
-    # the light is that of one plane, of which little is known
+    # the light is that of one plane, which shows little of it
     window.write("Shadow strength", "0.5", effect=lambda: state_of(project).weights.shadow == 0.5)
 
 

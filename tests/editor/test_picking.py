@@ -1,4 +1,4 @@
-"""Selection by rectangle, click and brush, and points that are clicked in photos."""
+"""Selection by rectangle, click and brush, and clicked points in photos."""
 
 from pathlib import Path
 
@@ -119,7 +119,7 @@ def test_a_photo_is_shown_upright_with_its_own_size(tmp_path: Path) -> None:
     found, size = read_upright(tmp_path / "a.png", 50)
     assert size == (60, 100)
     assert found.shape == (50, 30, 3)
-    # what was left is above now
+    # the left side is now above
     assert found[:20, :, 0].min() > 250
     assert found[30:, :, 0].max() < 5
 

@@ -78,7 +78,7 @@ def test_operations_keep_what_they_do_not_change(session: Session) -> None:
     # the plane's Gaussians are a hundredth thick and were trained for sixty steps
     assert abs(float(fallen.points(item.base.point)[2])) < 0.1
     assert float(fallen.points(item.base.point)[2]) < float(straight.points(item.base.point)[2])
-    # the turn about the vertical stayed: heads of a vector at right angles to up agree, but for the slope of the plane
+    # the yaw stayed: headings of a horizontal vector agree, except for the slope of the plane
     side = torch.linalg.cross(item.base.up, torch.tensor([1.0, 0, 0]))
     heads = [m.rotation @ side / side.norm() for m in (straight, fallen)]
     assert float(heads[0] @ heads[1]) > 0.98

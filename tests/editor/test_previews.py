@@ -1,4 +1,4 @@
-"""Pictures and previewed light are what the steps write, bit for bit; drafts are computed on a coarse composite."""
+"""Pictures and previewed light equal the steps' output, bit for bit; drafts are computed on a coarse composite."""
 
 import shutil
 from dataclasses import replace
@@ -29,7 +29,7 @@ from splatgraft.relighting.layers import pasted
 
 @pytest.fixture(scope="module")
 def lit(finished_project: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A project from photographs with the physical light transfer, and its results up to the pasted object."""
+    """Return a project from photographs with the physical light transfer, and its results up to the pasted object."""
     folder = copy_of(finished_project, tmp_path_factory.mktemp("lit"))
     file = folder / "project.toml"
     file.write_text(with_keys(file.read_text(), "relight", {"light": "transfer"}))

@@ -26,7 +26,7 @@ def test_a_transfer_between_two_scene_files(tmp_path: Path, capsys: pytest.Captu
     assert "a scene without photographs: 8 pictures" in said
     assert "up is taken to be (0.00, 0.00, 1.00)" in said
     root = project.parent
-    # what is a guess is shown
+    # guesses are shown
     (guess,) = [note for note in read_record(root / "target" / "capture").warnings if note.in_doubt]
     assert guess.picture is not None
     assert (root / "target" / "capture" / guess.picture).is_file()

@@ -234,7 +234,7 @@ def test_a_file_that_cannot_be_read_is_named_and_stays_until_it_is_corrected(ses
     for text in BAD_PLACEMENTS:
         content = text.encode("utf-8", "surrogateescape")
         file.write_bytes(content)
-        # an open editor and one that is started say what is wrong in one line, and write nothing
+        # a running editor and a starting one name the error in one line, and write nothing
         for attempt in (
             session.reload,
             session.undo,

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 HANG_LIMIT = 120.0
-"""Seconds after which a wait is taken for a hang; more than ten times the slowest wait on an idle machine."""
+"""Seconds after which a wait counts as hanging; more than ten times the slowest wait on an idle machine."""
 
 
 def wait_until(
@@ -17,7 +17,7 @@ def wait_until(
     pause: Callable[[float], object] = time.sleep,
     limit: float = HANG_LIMIT,
 ) -> None:
-    """Poll until `condition` holds; fails with `what` after `limit` seconds."""
+    """Poll until `condition` holds; fail with `what` after `limit` seconds."""
     end = time.monotonic() + limit
     while not condition():
         assert time.monotonic() < end, f"waited {limit:.0f} s for {what}"
@@ -31,7 +31,7 @@ def act_until(
     what: str,
     pause: Callable[[float], object] = time.sleep,
 ) -> None:
-    """Repeat `action` until `effect` holds; does nothing where it holds already.
+    """Repeat `action` until `effect` holds; do nothing if it holds already.
 
     The time between repetitions doubles from 5 seconds. `action` must be safe to repeat.
     """

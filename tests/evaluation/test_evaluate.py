@@ -1,4 +1,4 @@
-"""`evaluate`: means over views, as the report has them; `true_views` pairs images by name."""
+"""`evaluate`: means over views, as in the report; `true_views` pairs images by name."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +31,7 @@ def test_the_means_are_the_report_s() -> None:
     assert found == measure(views)["result"]
     # noise of deviation 0.02 has 34 dB
     assert found["psnr"] == pytest.approx(34.0, abs=0.2)
-    # a region that no view has
+    # a region without pixels in any view
     truth = replace(TRUTHS[0], image=TRUTHS[0].background, mask=torch.zeros(80, 120))
     found = evaluate(images[:1], [truth], backgrounds=[truth.background])
     assert found["object_psnr"] is found["shadow_psnr"] is None
@@ -70,11 +70,11 @@ def test_a_view_of_the_whole_object_is_shown_before_a_larger_one_that_is_cut() -
 
     cut, whole, small, tiny = at("cut", 0, 16), at("whole", 20, 10), at("small", 20, 9), at("tiny", 20, 3)
     assert max((cut, whole, small), key=lambda p: p.prominence) is whole
-    # one that hardly shows it is not
+    # a view that hardly shows the object is not chosen
     assert max((cut, tiny), key=lambda p: p.prominence) is cut
-    # nor one of the side that no photograph shows
+    # nor is one of the side that no photograph shows
     assert max((replace(whole, guessed_share=0.5), small), key=lambda p: p.prominence) is small
-    # though it be twice as large
+    # even if it is twice as large
     assert max((replace(at("large", 20, 14), guessed_share=0.4), small), key=lambda p: p.prominence) is small
 
 
@@ -89,7 +89,7 @@ def test_the_best_view_is_sought_among_all_cameras() -> None:
     cameras = pinhole(poses, 200.0, width=160, height=120)
     scenes = EvaluatedScenes(object_, object_, ~nothing, nothing, cameras)
     assert scenes.best_view == 17
-    # a narrower one that is cut is no better, and one of the whole object from nearer is
+    # a narrower cut view is not better, but a nearer one of the whole object is
     nearer = cameras.world_from_camera.clone()
     nearer[5] = look_at(torch.tensor([[0.0, -2.5, 0.5]]), torch.tensor([0.0, 0.0, 0.3]), torch.tensor([0.0, 0, 1]))[0]
     assert replace(scenes, cameras=pinhole(nearer, 200.0, width=160, height=120)).best_view == 5

@@ -17,13 +17,13 @@ EYE = torch.tensor([[0.0, -2.0, 1.5]])
 
 
 def camera(pitch_deg: float = PITCH_DEG) -> Cameras:
-    """At `EYE`, looking along +y and down."""
+    """Return a camera at `EYE` that looks along +y and down."""
     aim = EYE[0] + torch.tensor([0.0, 1.0, -math.tan(math.radians(pitch_deg))])
     return pinhole(look_at(EYE, aim, UP), 60.0, width=80, height=60)
 
 
 def plane_depth(camera: Cameras, normal: Tensor, offset: float) -> Tensor:
-    """Depth of the plane `normal . x = offset`; 0 where the camera does not see it."""
+    """Return the depth of the plane `normal . x = offset`; 0 if the camera does not see it."""
     rays = camera.rays() @ camera.world_from_camera[0, :3, :3].T
     depth = (offset - camera.centers[0] @ normal) / (rays @ normal)
     return torch.where(depth > 0, depth, 0.0)
@@ -43,7 +43,7 @@ def test_colors_fall_along_a_receding_floor() -> None:
     rising = brightness(colors[horizon:, 40]).diff()
     assert (rising >= 0).all()
     assert rising.gt(0).float().mean() > 0.8
-    # a unit of length is nothing to the colours; 1e-5 for float32 of a table's interpolation
+    # a unit of length does not change the colours; 1e-5 for float32 of a table's interpolation
     assert depth_colors(1000 * depth).sub(colors).abs().max() < 1e-5
     assert (depth_colors(torch.zeros(4, 5)) == 0).all()
 

@@ -11,7 +11,7 @@ from splatgraft.evaluation.pictures import change_map, describe_change
 
 
 def example_truth(shadow=0.5, seed=0):
-    """A grey wall with an object in the middle and a shadow beside it that leaves `shadow` of the linear light."""
+    """Return a grey wall with an object in the middle and a shadow beside it that leaves `shadow` of linear light."""
     g = torch.Generator().manual_seed(seed)
     background = 0.5 + 0.1 * torch.rand(80, 120, 3, generator=g)
     mask = torch.zeros(80, 120)
@@ -73,7 +73,7 @@ def test_copy_paste_without_shadow_misses_exactly_the_shadow():
     found = compare(pasted, truth, regions=find_regions(truth), background=truth.background)
     # ratio 1 instead of 0.5 in the core; the 3x3 mean makes the outermost rows a third or two thirds of that
     assert 0.4 < found["shadow_ratio_rmse"] < 0.5
-    # what is seen is in the shadow, and blurred by the eye over some pixels around it
+    # the visible part is in the shadow, and FLIP blurs it over some pixels around it
     assert found["shadow_flip"] > 0.1 > 10 * found["object_flip"]
     assert found["rest_max_change"] == 0
 
@@ -84,7 +84,7 @@ def test_reconstruction_error_of_the_scene_does_not_count_as_shadow_error():
     image, background = truth.image * dimmer, truth.background * dimmer
     regions = find_regions(truth)
     found = compare(image, truth, regions=regions, background=background)
-    # sRGB scaled by 0.9 scales linear light by nearly 0.9^2.4 above and below alike
+    # sRGB scaled by 0.9 scales linear light by nearly 0.9^2.4 in both regions
     assert found["shadow_ratio_rmse"] < 0.01
     assert found["shadow_psnr"] < 40
 

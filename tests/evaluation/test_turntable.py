@@ -76,7 +76,7 @@ def test_turning_the_world_turns_the_path():
 def test_it_starts_where_it_is_told_to(span):
     start = torch.tensor([math.cos(math.radians(100)), math.sin(math.radians(100)), 0.0])
     path = turntable_cameras(captured(*span), CENTER, up=UP, options=TurntableOptions(frames=36, start=start))
-    # frames of a full circle are 10 degrees apart, of an arc of 120 degrees back and forth at most so
+    # frames of a full circle are 10 degrees apart; those of an arc of 120 degrees, back and forth, at most as much
     assert math.degrees(float(angles_and_rings(path)[0][0])) == pytest.approx(100, abs=6)
 
 

@@ -1,4 +1,4 @@
-"""Puts the folders on the path whose scenes and browser the tests of exports use."""
+"""Paths of the folders with scenes and browser for the tests of exports."""
 
 import sys
 from pathlib import Path

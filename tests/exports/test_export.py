@@ -1,4 +1,4 @@
-"""`export`: what it finds in a scene, a folder and a project, frames, layers, pictures, turntables, and the report."""
+"""`export`: its input from a scene, a folder or a project; frames, layers, pictures, turntables, and the report."""
 
 import json
 import re
@@ -59,7 +59,7 @@ def test_a_project_knows_its_layers_its_frame_and_its_name(source):
 def test_its_folders_lead_to_the_project(project):
     for path in (project / "relit", project / "result"):
         assert read_export_source(path).is_object is not None
-    # the composite and the target are scenes by themselves
+    # the composite and the target are scenes of their own
     assert same(read_export_source(project / "target/scene").scene, parts()["place"])
     assert read_export_source(project / "target/scene").cameras is not None
     assert read_export_source(project / "composite").is_object is None
@@ -103,7 +103,7 @@ def test_the_first_view_and_the_path_begin_on_the_side_that_was_photographed(tmp
     assert side * (view.eye[0] - view.center[0]) > 0.3
     first = path_around(source, view, frames=6, width=160).centers[0]
     assert side * (first[0] - view.center[0]) > 0.3
-    # flags of another scene are not taken
+    # flags of another scene are not used
     np.save(project / "object/is_guessed.npy", np.ones(3, bool))
     assert read_export_source(project).photographed_side is None
 
@@ -215,12 +215,12 @@ def test_versions_of_spz(source, tmp_path):
 def test_the_shadow_over_the_place_is_the_scene_without_its_object(source):
     layer = shadow_layer(source)
     p = parts()
-    camera = source.cameras.resized(4.0)[1]  # a size that was not fitted
+    camera = source.cameras.resized(4.0)[1]  # a size without a fit
     place, scene = (render(p[name], camera).color[0].clamp(0, 1) for name in ("place", "shadowed"))
     drawn = render(layer.gaussians, camera)
     assert float(drawn.color.abs().max()) < 1e-5  # black
     over = place * (1 - drawn.alpha[0][..., None])
-    # at most half of the error is left: 144 wide Gaussians cannot draw the shadow's edge any better
+    # at most half of the error remains: 144 wide Gaussians cannot draw the shadow's edge better
     assert psnr(over, scene) > psnr(place, scene) + 6
     assert layer.psnr is not None
     assert layer.psnr > psnr(place, scene) + 6
@@ -283,7 +283,7 @@ def test_a_turntable_as_video(project, source, tmp_path, capsys):
     # lossy, and colour at half of the size; frames of the path are below 25 dB apart
     assert psnr(found[0], expected) > 28
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
-    # it is no wider than what was captured unless that is asked for
+    # it is no wider than the photographs unless an option says so
     assert main([*words[:-4], "--frames", "2"]) == 0
     assert source.cameras is not None
     assert f" of {int(source.cameras.sizes[0, 0])} x " in capsys.readouterr().err

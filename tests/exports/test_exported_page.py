@@ -1,4 +1,4 @@
-"""The exported page in Chromium without a network: it shows what our renderer draws, and asks nobody for anything.
+"""The exported page in Chromium without a network: it shows the same as our renderer, and sends no request.
 
 The engine inside is also the reader of .glb that is not ours.
 """
@@ -38,9 +38,9 @@ from splatgraft.rendering import render
 ENGINE = files("splatgraft.exports") / "viewer" / "playcanvas.js"
 SIZE = (480, 360)
 HIDDEN = "h1, .corner, .bar, #divider, #message { opacity: 0 }"
-"""What lies over the canvas would be compared as well."""
+"""Elements over the canvas, which would otherwise be compared as well."""
 CLOSE_DB = 35.0
-"""The scene in 8 bits, drawn by a rasteriser that ends Gaussians earlier than ours and stores colours in 16 bits:
+"""Minimum PSNR of the scene in 8 bits, drawn by a rasteriser that cuts Gaussians earlier, with colours in 16 bits:
 36.7 dB and more were measured here, 38.1 for the demo; before and after are 21 apart."""
 
 
@@ -68,7 +68,7 @@ def page_file(project) -> Path:
 
 
 class Page:
-    """An open page, with everything that it asked for."""
+    """An open page, with all its requests."""
 
     def __init__(self, browser: Any, file: Path, size: tuple[int, int] = SIZE, **context: Any) -> None:
         self.context = browser.new_context(offline=True, viewport={"width": size[0], "height": size[1]}, **context)
@@ -85,7 +85,7 @@ class Page:
         self.page.add_style_tag(content=HIDDEN)
 
     def picture(self) -> torch.Tensor:
-        """The canvas, when the page has drawn all that changed."""
+        """Return the canvas after the page has drawn all changes."""
         self.page.wait_for_selector("body[data-still=true]")
         return screenshot(self.page)
 
@@ -99,7 +99,7 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def ours(project: Path, size: tuple[int, int] = SIZE) -> tuple[torch.Tensor, torch.Tensor]:
-    """Before and after from the page's first view, drawn by our renderer.
+    """Return before and after from the page's first view, drawn by our renderer.
 
     A page that is narrower than the view shows its width, up to twice the height.
     """
@@ -114,15 +114,15 @@ def ours(project: Path, size: tuple[int, int] = SIZE) -> tuple[torch.Tensor, tor
 
 
 def divided(before: torch.Tensor, after: torch.Tensor, column: int | None = None) -> torch.Tensor:
-    """The first left of a column, the middle where none is given, the second right of it."""
+    """Return the first picture left of a column, the middle by default, and the second right of it."""
     at = before.shape[1] // 2 if column is None else column
     return torch.cat([before[:, :at], after[:, at:]], 1)
 
 
 def test_a_story_of_the_page(browser, project, page_file):
-    """It shows what the renderer draws, compares, turns, finds back, and asks for nothing outside."""
+    """The page shows the renderer's picture, compares, turns, finds the first view, and makes no outside request."""
     before, after = ours(project)
-    assert psnr(before, after) < 28  # what is compared differs
+    assert psnr(before, after) < 28  # the two compared pictures differ
     page = Page(browser, page_file)
     assert page.page.locator("#still").count() == 0
     page.page.get_by_role("button", name="Before").click(force=True)
@@ -141,7 +141,7 @@ def test_a_story_of_the_page(browser, project, page_file):
     page.page.mouse.wheel(0, -300)
     assert psnr(page.picture(), turned) < 30
     page.page.get_by_role("button", name="Back to the first view").click(force=True)
-    assert psnr(page.picture(), first) > 45  # the same but for the last bit of the angles
+    assert psnr(page.picture(), first) > 45  # equal except for the last bit of the angles
     for _ in range(5):  # 6 degrees each
         page.page.keyboard.press("ArrowLeft")
     assert psnr(page.picture(), first) < 28
@@ -149,7 +149,7 @@ def test_a_story_of_the_page(browser, project, page_file):
 
     outside = [url for url in page.requests if not url.startswith(("blob:", "data:")) and url != page_file.as_uri()]
     assert outside == []
-    # and nothing can be: the page's own policy refuses
+    # the page's own policy refuses all requests
     refused = page.page.evaluate(
         "() => fetch('https://example.org/').then(() => 'fetched', (error) => String(error))",
     )
@@ -168,7 +168,7 @@ def test_the_divider_and_the_full_screen(browser, project, page_file):
     page.page.get_by_role("button", name="After").click(force=True)
     after = page.picture()
     assert divider.get_attribute("aria-valuenow") == "0"
-    handle = divider.locator("svg").bounding_box()  # half of it is in the page
+    handle = divider.locator("svg").bounding_box()  # half of it is on the page
     page.page.mouse.move(handle["x"] + 30, handle["y"] + 22)
     page.page.mouse.down()
     page.page.mouse.move(264, 100, steps=4)
@@ -213,7 +213,7 @@ def test_fingers_turn_and_pinch(browser, page_file):
     move("touchMove", (100, 180), (380, 180))
     move("touchEnd")
     assert psnr(page.picture(), turned) < 25
-    # a finger on every button, at the usual least size
+    # every button is at least as large as a fingertip
     for button in page.page.get_by_role("button").all():
         box = button.bounding_box()
         assert min(box["width"], box["height"]) >= 44
@@ -222,7 +222,7 @@ def test_fingers_turn_and_pinch(browser, page_file):
 
 @pytest.mark.parametrize("size", [SIZE, (640, 300), (200, 400)])
 def test_without_webgl_a_still_of_the_first_view_is_shown(browser, project, page_file, size):
-    """As before the engine has started, in pages of any shape; and the page says why."""
+    """A still shows before the engine has started, in pages of any shape, and the page says why."""
     context = browser.new_context(offline=True, viewport={"width": size[0], "height": size[1]})
     page = context.new_page()
     page.set_default_timeout(1000 * HANG_LIMIT)
@@ -231,7 +231,7 @@ def test_without_webgl_a_still_of_the_first_view_is_shown(browser, project, page
     page.wait_for_selector("body[data-state=failed]")
     assert page.inner_text("#message") == "This browser cannot draw the scene: it has no WebGL 2."
     page.add_style_tag(content=HIDDEN)
-    # 44 dB were measured: the still is a compressed picture of our renderer's
+    # 44 dB were measured: the still is a compressed picture of our renderer
     assert psnr(screenshot(page), divided(*ours(project, size))) > CLOSE_DB
     context.close()
 
@@ -244,7 +244,7 @@ def test_a_narrow_page_shows_the_width_of_the_first_view(browser, project, page_
 
 
 def test_a_shadow_of_many_faint_gaussians_has_the_hue_of_others(browser, tmp_path):
-    """`relight` splits the Gaussians under a shadow: blended in 8 bits, each was rounded, and they turned magenta.
+    """Gaussians that `relight` splits under a shadow keep their colour; blended in 8 bits they turned magenta.
 
     One strip of a plane is in a shadow that was photographed, the other in one of pieces, of median opacity 0.013.
     """
@@ -264,7 +264,7 @@ def test_a_shadow_of_many_faint_gaussians_has_the_hue_of_others(browser, tmp_pat
     page.context.close()
     own, lit, inserted = (lab[:, left : left + 30].mean((0, 1)) for left in (60, 105, 150))
     assert own[0] < 0.75 * lit[0]  # shadows
-    # our renderer has them 0.1 apart, as pieces are not quite their whole; 3.1 in 8 bits
+    # our renderer has them 0.1 apart, because pieces do not add up exactly; 3.1 in 8 bits
     assert np.abs(inserted - own)[1:].max() < 0.5
 
 
@@ -279,7 +279,7 @@ def test_one_scene_has_no_buttons_and_its_title_is_text_and_nothing_else(browser
     assert page.page.get_attribute("body", "data-taken") is None
     assert page.page.locator("#scenes button").count() == 0
     picture = page.picture()
-    assert 0.01 < float(((picture - 0.8).abs().amax(2) > 0.05).float().mean()) < 0.6  # a ball before grey
+    assert 0.01 < float(((picture - 0.8).abs().amax(2) > 0.05).float().mean()) < 0.6  # a ball in front of grey
     page.context.close()
 
 

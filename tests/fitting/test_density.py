@@ -27,7 +27,7 @@ def test_children_lie_on_the_long_axis_and_keep_its_variance():
 
 
 def split_parents(error_every: int) -> list[float]:
-    """x of the Gaussians that stay whole: three side by side, of equal gradients but for the left one, which has a
+    """Return x of the unsplit Gaussians: three side by side of equal gradients, but the left one has a
     tenth more; the residual lies under the right one."""
     gaussians = Gaussians(
         means=torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]]),

@@ -1,4 +1,4 @@
-"""The loop that fits Gaussians to images: fields, rates, the views' colours, resuming."""
+"""The loop that fits Gaussians to images: fields, rates, the views' colours, checkpoints."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def ring(count: int, size: int = 32) -> camera_values.Cameras:
 
 
 class Photographs(list[View]):
-    """Views that every step sees whole."""
+    """Views that every step sees at full size."""
 
     def at(self, index: int, *, visit: int, done: float) -> View:
         return self[index]
@@ -63,7 +63,7 @@ def test_colours_alone_are_recovered_and_all_else_stays():
         (render(g, ring(6)).color.clamp(0, 1) - render(truth, ring(6)).color.clamp(0, 1)).square().mean()
         for g in (start, fitted)
     )
-    # linear in the colours, so nothing but the number of steps stands between the fit and zero error
+    # linear in the colours, so only the number of steps separates the fit from zero error
     assert after < 0.02 * before
 
 
@@ -115,7 +115,7 @@ def test_views_that_are_brighter_from_one_side_do_not_make_the_scene_brighter_fr
     truth = replace(truth, sh=torch.cat([truth.sh[:, :1], torch.zeros(60, 3, 3)], 1))
     gains = (1.3, 1.3, 1.3, 0.7, 0.7, 0.7)
     views, grey = views_of(truth, gains), replace(truth, sh=torch.zeros_like(truth.sh))
-    # how much the scene's look depends on the direction
+    # measure of the dependence of colour on direction
     bands = []
     for known in (None, gains):
         rates = LearningRates(sh=0.02, sh_higher=0.02, view_colors=0.003)
@@ -131,7 +131,7 @@ def test_a_random_background_leaves_no_holes_before_what_is_dark():
         background = None if random else (0.0, 0.0, 0.0)
         fitted = fit(dark, views, FitOptions(60, LearningRates(opacity_logits=0.05), background))
         alphas.append(float(render(fitted, cameras).alpha.mean()))
-    # what comes through from a random background, half bright in the mean, is an error of as much
+    # light of a random background, half bright in the mean, that comes through is an equal error
     assert alphas[1] > 1.1 * alphas[0]
 
 
@@ -143,23 +143,23 @@ def test_what_a_mask_leaves_out_shows_the_background_and_what_is_hidden_counts_f
     left = torch.arange(32)[None, :, None].expand(32, 32, 1) < 16
 
     def error(views: Photographs) -> tuple[float, float]:
-        """Of the opacity after a fit from a thinner scene, in the left and in the right half."""
+        """Return mean opacity after a fit from a thinner scene, in the left and in the right half."""
         thin = replace(truth, opacity_logits=truth.opacity_logits - 2)
         fitted = fit(thin, views, FitOptions(90, LearningRates(opacity_logits=0.1), background=None))
         missed = (render(fitted, cameras).alpha - drawn.alpha)[..., None].abs()
         return float(missed[:, left].mean()), float(missed[:, ~left].mean())
 
-    # without masks, the black around the object is taken for what is fitted
+    # without masks, the fit takes the black around the object for its surface
     seen = [replace(view, mask=mask, image=_over_nothing(view, mask)) for view, mask in zip(whole, masks, strict=True)]
     assert sum(error(Photographs(seen))) < 0.5 * sum(error(whole))
-    # something hides the right half, so that it is not in the masks
+    # an occluder hides the right half, so it is not in the masks
     hidden = [replace(view, mask=view.mask * left) for view in seen]
     ignored = Photographs(replace(view, is_compared=left) for view in hidden)
     assert error(ignored)[1] < 0.5 * error(Photographs(hidden))[1]
 
 
 def _over_nothing(view: View, mask: torch.Tensor) -> torch.Tensor:
-    """The colours of a picture over black before they were multiplied by its mask."""
+    """Return the colours of a picture over black, undoing the multiplication by its mask."""
     return (view.image.float() / mask.float().clamp_min(1) * 255).clamp(0, 255).round().to(torch.uint8)
 
 

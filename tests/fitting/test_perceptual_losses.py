@@ -14,7 +14,7 @@ def noise(*shape: int, seed: int = 0) -> torch.Tensor:
 
 
 def reference_fourier(image: np.ndarray, target: np.ndarray, size: int = 16, weight: float = 0.1) -> float:
-    """Window by window with numpy's full FFT."""
+    """Compute the loss window by window with numpy's full FFT."""
     hop, (h, w, _) = size // 2, image.shape
     ramp = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size)
     window = np.outer(ramp, ramp)
@@ -48,7 +48,7 @@ def test_fourier_is_differentiable_and_zero_at_the_target():
 @pytest.mark.parametrize("shape", [(48, 64), (37, 51), (9, 40)])
 def test_fourier_has_the_same_gradient_in_single_precision(shape):
     image, target = noise(*shape, 3), noise(*shape, 3, seed=1)
-    target[:4] = image[:4] = 0  # windows without any light have a gradient of 0
+    target[:4] = image[:4] = 0  # windows without light have a gradient of 0
 
     def gradient(x):
         x = x.requires_grad_()
@@ -60,7 +60,7 @@ def test_fourier_has_the_same_gradient_in_single_precision(shape):
 
 
 def test_fourier_forgives_a_shift_that_l1_does_not():
-    # edges a pixel apart: an average of the two is as near as possible for L1, and far for the magnitudes
+    # edges a pixel apart: an average of the two is optimal for L1, and bad for the magnitudes
     edges = (noise(64, 64, 3) > 0.5).float()
     edges = F.interpolate(edges.permute(2, 0, 1)[None, :, ::8, ::8], scale_factor=8)[0].permute(1, 2, 0)
     shifted = edges.roll(1, 1)
@@ -71,14 +71,14 @@ def test_fourier_forgives_a_shift_that_l1_does_not():
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory):
-    """Files in the layout of the published ones, with random numbers."""
+    """Write files in the layout of the published ones, with random numbers."""
     folder = tmp_path_factory.mktemp("weights")
     write_random_lpips(folder)
     return folder
 
 
 def reference_lpips(folder, image: torch.Tensor, target: torch.Tensor) -> float:
-    """VGG-16 as torchvision lists its layers, cut where LPIPS taps it."""
+    """Return LPIPS by VGG-16 in torchvision's list of layers, cut at LPIPS's taps."""
     vgg, heads = (torch.load(folder / name, weights_only=True) for name in (VGG_FILE, HEADS_FILE))
     layers: list[torch.nn.Module] = []
     for width in (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512):

@@ -1,4 +1,4 @@
-"""Losses on inverse depth: planes cost nothing, edges of the photograph separate surfaces, and bare parts are held."""
+"""Losses on inverse depth: planes cost nothing, edges of the photograph separate surfaces, bare parts are held."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ UP = torch.tensor([0.0, 0.0, 1.0])
 
 
 def loss(inverse: torch.Tensor, image: torch.Tensor, *, spread: float = 0.0, bend: float = 1.0, unit: float = 1.0):
-    """Mean over many draws, of opaque pixels that show one depth each."""
+    """Return the loss of opaque pixels with one depth each, mean over many draws."""
     moments = torch.stack([inverse, inverse.square()], -1)
     rule = SurfaceLoss(unit=unit, spread=spread, bend=bend)
     alpha = torch.ones_like(inverse)
@@ -37,7 +37,7 @@ def test_a_plane_costs_nothing_and_a_step_only_where_the_photograph_has_no_edge(
     assert loss(halves, plain) > 0.02
     painted = plain.clone()
     painted[:, 32:] = 0.7
-    # no difference reaches over the edge, and both halves are planes
+    # no difference crosses the edge, and both halves are planes
     assert loss(halves, painted) < 1e-6
 
 
@@ -68,7 +68,7 @@ def test_the_unit_of_the_world_does_not_matter():
 
 
 def table() -> tuple[Gaussians, torch.Tensor]:
-    """A plain square with a checkered rim, and which Gaussians are plain."""
+    """Return a plain square with a checkered rim, and a mask of the plain Gaussians."""
     grid = torch.linspace(-1, 1, 41)
     points = torch.cartesian_prod(grid, grid)
     plain = points.abs().amax(1) < 0.75
@@ -83,7 +83,7 @@ def test_a_bare_table_is_held_by_its_rim():
     cameras = ring(6)
     with torch.no_grad():
         views = as_views(cameras, [render(truth, camera).color[0] for camera in cameras])
-    # its middle sags, which no photograph shows
+    # its middle sags, but no photograph shows this
     sag = 0.2 * (1 - (truth.means[:, :2].abs().amax(1) / 0.75).square()).clamp_min(0)
     start = replace(truth, means=truth.means - sag[:, None] * UP)
     left = {}

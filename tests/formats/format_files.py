@@ -1,4 +1,4 @@
-"""Scenes and captures that the tests of the formats write and read."""
+"""Scenes and captures for the tests of the formats."""
 
 import json
 import struct
@@ -27,7 +27,7 @@ def random_gaussians(n: int = 40, degree: int = 3, seed: int = 0) -> Gaussians:
 
 
 def equal(a: Gaussians, b: Gaussians) -> bool:
-    """Bit for bit, nan included."""
+    """Check equality bit for bit, nan included."""
     return all(
         getattr(a, name).numpy().tobytes() == getattr(b, name).numpy().tobytes()
         and getattr(a, name).shape == getattr(b, name).shape
@@ -36,7 +36,7 @@ def equal(a: Gaussians, b: Gaussians) -> bool:
 
 
 def rotation_and_quaternion(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """A rotation by Rodrigues' formula and its quaternion wxyz: independent of the package."""
+    """Return a rotation by Rodrigues' formula and its quaternion wxyz, independent of the package."""
     rng = np.random.default_rng(seed)
     axis, angle = rng.normal(size=3), rng.uniform(0.3, 2.8)
     axis /= np.linalg.norm(axis)
@@ -63,7 +63,7 @@ def write_colmap(
     text: bool = False,
     points: int = 3,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """A model with one camera; the poses camera_from_world in the order of `names`."""
+    """Write a model with one camera and the poses camera_from_world in the order of `names`."""
     folder.mkdir(parents=True, exist_ok=True)
     model, width, height, parameters = camera
     poses, lines, records = [], [], []
@@ -95,7 +95,7 @@ def write_colmap(
 
 
 def write_transforms(folder: Path, content: dict, *, frames: int = 2, size: tuple[int, int] = (24, 16)) -> Path:
-    """A transforms.json of `frames` photographs that exist; `content` overrides or adds keys."""
+    """Write a transforms.json of `frames` existing photographs; `content` overrides or adds keys."""
     listed = []
     for i in range(frames):
         write_photo(folder / "images" / f"{i:04d}.png", *size, seed=i)
@@ -116,7 +116,7 @@ def glb(content: dict, binary: bytes) -> bytes:
 
 
 def parts_of_glb(data: bytes) -> tuple[dict, bytes]:
-    """JSON and binary chunk."""
+    """Return JSON and binary chunk."""
     length = struct.unpack_from("<I", data, 12)[0]
     return json.loads(data[20 : 20 + length]), data[28 + length :]
 

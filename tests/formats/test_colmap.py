@@ -22,7 +22,7 @@ def with_photos(root, names=("b.png", "a.png"), model="sparse/0", **options):
 def test_poses_points_and_pictures(tmp_path, text):
     poses = with_photos(tmp_path, text=text)
     capture = formats.read_capture(tmp_path)
-    assert capture.cameras.names == ("a.png", "b.png")  # by name, not in the file's order
+    assert capture.cameras.names == ("a.png", "b.png")  # by name, unlike the file's order
     for i, (rotation, translation) in enumerate(reversed(poses)):
         expected = np.concatenate([rotation, translation[:, None]], 1)
         found = capture.cameras.camera_from_world[i, :3].numpy()

@@ -24,7 +24,7 @@ from splatgraft import formats
 from splatgraft.core.images import read_alpha, read_mask, read_rgb, stored_size
 
 FEW, MANY = 6, 60
-"""Examples of each case; many in `make test-all`."""
+"""Number of examples of each case; many in `make test-all`."""
 FROM_TOOLS = ("scene.sog", "scene.glb", "scene.v3.spz", "scene.v4.spz", "scene.level0.ksplat", "scene.level2.ksplat")
 
 LIES = b"0 -1 1e9 nan 999999999999 18446744073709551615 inf \xff\xfe null [] {}".split()
@@ -34,7 +34,7 @@ BINARY_LIES += [struct.pack("<f", float("nan")), struct.pack("<d", float("inf"))
 
 @st.composite
 def damages(draw) -> Callable[[bytes], bytes]:
-    """One to three of: cut, flipped bits, a stretch replaced, repeated or removed, a number replaced by a lie."""
+    """Damage bytes one to three times: cut, flip bits, replace, repeat or remove a stretch, or write a wrong number."""
     kinds = st.sampled_from(["cut", "flip", "replace", "repeat", "remove", "number", "lie", "append"])
     step = st.tuples(kinds, st.floats(0, 1), st.binary(min_size=1, max_size=12), st.integers(1, 24))
     steps = draw(st.lists(step, min_size=1, max_size=3))
@@ -112,7 +112,7 @@ def seeds(tmp_path_factory) -> Path:
 
 
 def fuzz(seeds: Path, relative: str, reader: Callable[[Path], object], damage: Callable[[bytes], bytes]) -> None:
-    """The file damaged in place, read, and put back."""
+    """Damage the file in place, read it, and restore it."""
     path = seeds / relative
     whole = path.read_bytes()
     path.write_bytes(damage(whole))
@@ -126,7 +126,7 @@ def fuzz(seeds: Path, relative: str, reader: Callable[[Path], object], damage: C
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         path.write_bytes(whole)
-    # a deflated byte may honestly hold 1032; text becomes objects of about 60 bytes per word; 4 MB for code and headers
+    # a deflated byte may really hold 1032; text becomes objects of about 60 bytes per word; 4 MB for code and headers
     assert peak < 1100 * size + 4_000_000
 
 
@@ -177,7 +177,7 @@ def test_damaged_in_many_ways(seeds, name, damage):
 @given(damage=anything)
 @settings(max_examples=FEW, **DERANDOMIZED)
 def test_json_of_glb(seeds, damage):
-    """Damage inside the JSON alone, which damage of the whole file seldom leaves to be JSON."""
+    """Damage only the JSON; damage of the whole file seldom leaves valid JSON."""
     data = (seeds / "scene.glb").read_bytes()
     length = struct.unpack_from("<I", data, 12)[0]
 
@@ -190,8 +190,8 @@ def test_json_of_glb(seeds, damage):
 
 
 def refused(path: Path) -> str:
-    """The message with which `path` is refused, without much memory."""
-    formats.read_scene(format_files.TOOLS / "scene.sog")  # what is loaded at the first use is not the file's
+    """Return the message that refuses `path`, and check that little memory was used."""
+    formats.read_scene(format_files.TOOLS / "scene.sog")  # modules loaded at the first use are not the file's memory
     tracemalloc.start()
     try:
         with pytest.raises(ValueError, match="expected") as caught:
@@ -204,7 +204,7 @@ def refused(path: Path) -> str:
 
 
 def gzip_bomb() -> bytes:
-    """A valid .spz of version 2 with 6 million equal Gaussians: 114 MB in 110 kB."""
+    """Return a valid .spz of version 2 with 6 million equal Gaussians: 114 MB in 110 kB."""
     n = 6_000_000
     deflate = zlib.compressobj(9, zlib.DEFLATED, 31)
     out = deflate.compress(struct.pack("<IIIBBBB", 0x5053474E, 2, n, 0, 12, 0, 0))
@@ -241,10 +241,10 @@ def test_spz_with_a_wrong_header_or_checksum(tmp_path):
 
 
 def test_picture_bomb(tmp_path):
-    """9,000 x 9,000 equal pixels are a few kB of lossless WebP, and 324 MB unpacked."""
+    """Check a picture of 9,000 x 9,000 equal pixels: a few kB of lossless WebP, and 324 MB unpacked."""
     files = format_files.files_of_zip(format_files.TOOLS / "scene.sog")
     huge = bytearray(files["means_l.webp"])
-    # the size stands in the 28 bits behind the signature of the lossless chunk
+    # the 28 bits after the signature of the lossless chunk hold the size
     at = huge.index(b"VP8L") + 9
     bits = struct.unpack_from("<I", huge, at)[0]
     struct.pack_into("<I", huge, at, bits & 0xF0000000 | 8999 << 14 | 8999)

@@ -1,4 +1,4 @@
-"""3DGS .ply and point clouds: bit for bit round trips, the layouts that programs write, and refusals in one line."""
+"""3DGS .ply and point clouds: bit for bit round trips, layouts of other programs, and refusals in one line."""
 
 import format_files
 import numpy as np
@@ -15,7 +15,7 @@ TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 
 
 def columns_of(g):
-    """Every field under its .ply name, written down independently of the writer."""
+    """Return every field under its .ply name, independently of the writer."""
     out = {"x": g.means[:, 0], "y": g.means[:, 1], "z": g.means[:, 2], "opacity": g.opacity_logits}
     for i in range(3):
         out |= {f"f_dc_{i}": g.sh[:, 0, i], f"scale_{i}": g.log_scales[:, i]}

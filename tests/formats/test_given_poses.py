@@ -13,7 +13,7 @@ from splatgraft.formats.captures.masks import find_photos
 
 
 def poses(path: Path, names: list[str]) -> Path:
-    """A transforms.json whose images are not there."""
+    """Write a transforms.json without its images."""
     pose, frames = np.eye(4), []
     for i, name in enumerate(names):
         pose[:3, 3] = (i, 0.1 * i, -4)

@@ -78,7 +78,7 @@ def test_no_masks_and_alpha_that_is_full_everywhere_is_none(tmp_path):
 
 @pytest.mark.parametrize("place", ["masks/0001.png", "mask/0001.png", "images/0001_mask.png", "images/0001.mask.png"])
 def test_masks_by_the_conventions_of_the_field(tmp_path, place):
-    """As Metashape and RealityCapture write them, too; for photos with poses and without."""
+    """Masks as Metashape and RealityCapture write them are found, for photos with poses and without."""
     format_files.write_transforms(tmp_path, {})
     format_files.write_photo(tmp_path / place)
     expected = (None, tmp_path / place)

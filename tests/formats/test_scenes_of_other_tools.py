@@ -1,4 +1,4 @@
-"""Scenes that published tools wrote, against the .ply that they were made from; see golden/tools/README.md."""
+"""Scenes written by published tools, compared with their original .ply; see golden/tools/README.md."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ GLB = EXACT | {"log_scales": 3e-6, "opacities": 3e-6}  # exponentials and their 
 BYTE = 0.5 / 255
 """Half a step of a byte of [0, 1]."""
 SH_BYTE = BYTE / 0.2820948
-"""The same of a colour, as band 0."""
+"""Half a step of a colour's byte, as band 0."""
 SPZ = {
     "means": 0.5 / 4096,  # 12 fractional bits
     "log_scales": 0.5 / 16,
@@ -61,7 +61,7 @@ def original() -> Gaussians:
 
 
 def matched(original: Gaussians, found: Gaussians) -> Gaussians:
-    """`found` in the original's order, since most tools sort."""
+    """Return `found` in the original's order, because most tools sort."""
     assert found.count == original.count
     nearest = torch.cdist(original.means, found.means).argmin(1)
     assert len(nearest.unique()) == original.count
@@ -71,7 +71,7 @@ def matched(original: Gaussians, found: Gaussians) -> Gaussians:
 def assert_within(original: Gaussians, found: Gaussians, steps: dict[str, float]) -> None:
     found = matched(original, found)
     k = found.sh.shape[1]
-    # an ellipsoid is the same with its own axes reversed
+    # an ellipsoid is equal to itself with its own axes reversed
     ellipsoids = [
         g.rotations @ torch.diag(torch.tensor([1.0, 2, 3])) @ g.rotations.transpose(1, 2) for g in (original, found)
     ]
@@ -112,7 +112,7 @@ def test_sog_as_a_folder_or_its_meta_json(original, tmp_path):
 
 
 def decoded_by_gsply(name: str) -> Gaussians:
-    """golden/ was written and decoded by gsply 0.4.6 (MIT), from `format_files.random_gaussians(7, 2, seed=5)`."""
+    """Return a scene of golden/ as gsply 0.4.6 (MIT) decoded it, from `format_files.random_gaussians(7, 2, seed=5)`."""
     with np.load(GOLDEN / f"{name}.npz") as arrays:
         return Gaussians(**{key: torch.from_numpy(arrays[key]) for key in arrays.files})
 
@@ -132,7 +132,7 @@ def test_spz_that_was_written_without_turning_the_axes(original):
 
 @pytest.mark.parametrize("axes", ["RDF", "RUF", "UFR"])
 def test_changed_axes_show_the_same_scene(original, axes):
-    """A mirrored scene is seen by mirrored cameras: colours along mirrored directions, ellipsoids mirrored."""
+    """Mirrored cameras see a mirrored scene: colours along mirrored directions, ellipsoids mirrored."""
     matrix = rdf_from(axes)
     turned = change_axes(original, matrix)
     torch.testing.assert_close(turned.means, original.means @ matrix.T)

@@ -98,7 +98,7 @@ def test_nearly_rigid_poses_are_made_rigid(tmp_path):
     cameras = formats.read_cameras(format_files.write_transforms(tmp_path, {"w": 24, "h": 16, "frames": frames}))
     found = cameras.world_from_camera[0, :3, :3].double()
     assert (found.T @ found - torch.eye(3)).abs().max() < 1e-6  # float32
-    assert np.abs(found.numpy() @ np.diag([1, -1, -1]) - rotation).max() < 1e-4  # what the rounding took
+    assert np.abs(found.numpy() @ np.diag([1, -1, -1]) - rotation).max() < 1e-4  # loss by rounding
 
 
 def test_cameras_json_of_the_original_code(tmp_path):
@@ -190,7 +190,7 @@ def test_one_frame_that_is_not_usable_is_left_out_and_named(tmp_path, frame, exp
 
 
 def test_a_photo_posed_upright_is_read_upright(tmp_path):
-    # stored on its side, with EXIF orientation 6: the upright picture is turned clockwise from the stored one
+    # stored on its side, with EXIF orientation 6: the upright picture is the stored one turned clockwise
     path = format_files.write_transforms(tmp_path, {"w": 24, "h": 16})
     pixels = np.random.default_rng(5).integers(0, 256, (24, 16, 3), dtype=np.uint8)
     exif = Image.Exif()
@@ -200,7 +200,7 @@ def test_a_photo_posed_upright_is_read_upright(tmp_path):
     capture = formats.read_capture(path)
     assert not capture.left_out
     assert torch.equal(capture.image(0), upright)
-    # the same file, posed as it is stored: COLMAP ignores EXIF rotation
+    # the same file, posed in its stored orientation: COLMAP ignores EXIF rotation
     path.write_text(path.read_text().replace('"w": 24, "h": 16', '"w": 16, "h": 24'))
     (tmp_path / "images/0001.png").unlink()
     stored = formats.read_capture(path)

@@ -1,4 +1,4 @@
-"""Scenes that we write, as the formats' own tools and other programs read them; see golden/written/README.md."""
+"""Our written scenes, read by the formats' own tools and other programs; see golden/written/README.md."""
 
 import json
 import zipfile
@@ -53,7 +53,7 @@ def test_our_reader_finds_the_scene_within_the_steps(original, tmp_path, name):
 
 @pytest.mark.parametrize("name", BY_SPLAT_TRANSFORM)
 def test_the_recorded_tool_read_what_is_written_today(original, tmp_path, name):
-    """Our file of today decodes as the tool decoded the recorded one."""
+    """Our present file decodes like the tool's decoding of the recorded one."""
     theirs = formats.read_gaussians(WRITTEN / f"{name}.decoded.ply")
     assert_within(theirs, formats.read_gaussians(write(tmp_path / name, original)), DECODED[name])
     assert_within(theirs, formats.read_gaussians(WRITTEN / name), DECODED[name])
@@ -141,7 +141,7 @@ def test_spz_may_be_empty_and_has_bounds(tmp_path):
 
 
 def test_the_glb_is_what_the_specification_asks_for(original, tmp_path):
-    """The JSON beside that of splat-transform 3.7.0, and the values without our reader."""
+    """The JSON agrees with that of splat-transform 3.7.0, and the values are right without our reader."""
     formats.write_gaussians(tmp_path / "a.glb", original)
     content, binary = parts_of_glb((tmp_path / "a.glb").read_bytes())
     theirs, _ = parts_of_glb((TOOLS / "scene.glb").read_bytes())
@@ -173,11 +173,11 @@ def test_the_glb_is_what_the_specification_asks_for(original, tmp_path):
     rotation = values("KHR_gaussian_splatting:ROTATION")
     assert np.allclose(np.linalg.norm(rotation, axis=1), 1, atol=1e-5)
     assert json.dumps(content["asset"]) == '{"version": "2.0", "generator": "splatgraft"}'
-    # up is stated in the axes of the positions
+    # up is given in the axes of the positions
     formats.write_gaussians(tmp_path / "a.glb", original, metadata=formats.SceneMetadata(up=(0.48, -0.6, 0.64)))
     content, _ = parts_of_glb((tmp_path / "a.glb").read_bytes())
     assert content["asset"]["extras"] == {"up": pytest.approx([-0.48, 0.6, 0.64])}
-    # another program's extras may mean anything
+    # another program's extras may have any meaning
     content["asset"] = {"version": "2.0", "generator": "other", "extras": {"up": "Y"}}
     (tmp_path / "b.glb").write_bytes(glb(content, binary))
     assert formats.read_scene(tmp_path / "b.glb").metadata.up is None
@@ -199,14 +199,14 @@ def test_meta_json_of_sog_and_the_same_bytes_twice(tmp_path):
 
 
 def test_scalar_codes_are_nearly_the_best():
-    """Against uniform steps: Lloyd's codes are fitted to where the values are."""
+    """Lloyd's codes are closer to the values than uniform steps are."""
     values = np.random.default_rng(0).normal(size=20_000) ** 3
     codes = scalar_codes(values)
     error = np.square(codes[nearest_codes(values, codes)] - values).mean()
     steps = np.linspace(values.min(), values.max(), 256)
     uniform = np.square(steps[nearest_codes(values, steps.astype(np.float32))] - values).mean()
     assert error < 0.25 * uniform
-    # the nearest code is the nearest one
+    # the chosen code is the nearest one
     some = values[:500]
     off = np.abs(some[:, None] - codes)
     assert (np.abs(codes[nearest_codes(some, codes)] - some) <= off.min(1) + 1e-5).all()  # codes in float32

@@ -28,7 +28,7 @@ def example(h=45, w=70):
 
 
 def moved(network, seed=1):
-    """The same network with heads that are no longer zero."""
+    """Return the same network with heads that are no longer zero."""
     torch.manual_seed(seed)
     for head in (network.maps, network.by_normal, network.grid):
         torch.nn.init.normal_(head.weight, std=0.05)
@@ -60,7 +60,7 @@ def test_texture_off_the_object_is_multiplied_and_never_made_up():
     # light is never below zero
     off = (view.mask == 0).expand(-1, 3, -1, -1) & (lit > 0)
     brighter = apply_output(replace(view, composite=2 * view.composite + 0.004), plain)
-    # (2c + e) + e = 2 (c + e): the factor is the same, whatever the pixel's own light
+    # (2c + e) + e = 2 (c + e): the factor is independent of the pixel's own light
     torch.testing.assert_close((brighter + 0.004)[off], (2 * (lit + 0.004))[off], rtol=1e-4, atol=1e-5)
 
 

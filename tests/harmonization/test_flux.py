@@ -45,7 +45,7 @@ def flux(folder, *, say=lambda sentence: None, device=torch.device("cpu"), stren
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A harmoniser that no test changes."""
+    """Return a harmoniser that no test changes."""
     return flux_folder(tmp_path_factory.mktemp("flux") / "image-mask", WIDE)
 
 
@@ -64,7 +64,7 @@ def test_a_harmonizer_keeps_size_and_range_and_is_the_same_twice(folder):
 def test_a_padded_view_is_cropped_from_the_whole(folder):
     harmonizer, small = flux(folder), view(31, 47)
 
-    # what padding makes of it by hand: one more row and column, mirrored
+    # padding by hand: one more row and column, mirrored
     def grown(image):
         image = torch.cat([image, image[-2:-1]], 0)
         return torch.cat([image, image[:, -2:-1]], 1)
@@ -110,7 +110,7 @@ def test_parts_are_found_beside_the_weights_in_the_base_and_in_the_hub_s_cache(f
             flux("dot3d")
         prompt.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(folder / "empty_prompt.safetensors", prompt)
-        # the same weights, aligned otherwise in memory: products may round differently, by little after four steps
+        # the same weights, aligned otherwise in memory: products may round differently, but little after four steps
         for words in ({"folder": "nviolante/dot3d"}, {"folder": "dot3d"}, {"folder": "dot3d", "variant": "image-mask"}):
             assert torch.allclose(flux(**words).harmonize(view()).image, wanted, atol=1e-4)
     shutil.copytree(tmp_path / "hub/image-mask", tmp_path / "hub/image-background")

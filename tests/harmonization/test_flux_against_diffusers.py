@@ -1,4 +1,4 @@
-"""Against diffusers', PEFT's and transformers' own ways: the same sampling, adaptations, and empty prompt."""
+"""FLUX compared with diffusers, PEFT and transformers: the same sampling, adaptations, and empty prompt."""
 
 import json
 
@@ -60,7 +60,7 @@ def test_our_loop_is_the_stock_pipeline_s():
 
 
 def trained_by_script(folder, **config):
-    """The file that diffusers' train_dreambooth_lora_flux.py writes, after its own calls on a tiny transformer."""
+    """Write the file of diffusers' train_dreambooth_lora_flux.py, by its own calls on a tiny transformer."""
     from diffusers.training_utils import _collate_lora_metadata
 
     transformer = tiny_transformer()
@@ -78,7 +78,7 @@ def trained_by_script(folder, **config):
 
 @torch.no_grad()
 def randomise(transformer):
-    """Give the matrices B, which begin at zero, some values."""
+    """Set the matrices B, which begin at zero, to random values."""
     for name, parameter in transformer.named_parameters():
         if "lora_B" in name:
             parameter.normal_(0, 0.2, generator=torch.Generator().manual_seed(1))
@@ -163,7 +163,7 @@ def test_a_file_that_does_not_fit_is_one_line(tmp_path, kind):
 
 @pytest.fixture
 def text_encoders(tmp_path):
-    """Tiny T5 and CLIP with tokenizers, in the folders of FLUX."""
+    """Write tiny T5 and CLIP with tokenizers, in the folders of FLUX."""
     torch.manual_seed(0)
     clip = transformers.CLIPTextConfig(
         vocab_size=8, hidden_size=POOLED, intermediate_size=16, num_hidden_layers=1, num_attention_heads=2,
@@ -198,7 +198,7 @@ def test_the_empty_prompt_is_the_stock_pipeline_s_and_lies_where_harmonize_looks
         tokenizer_2=transformers.T5TokenizerFast.from_pretrained(folder / "tokenizer_2"),
     )
     tokens, pooled, _ = stock.encode_prompt("", "", max_sequence_length=6)
-    # the same layers on the same words; other kernels serve where gradients are kept
+    # the same layers on the same words; other kernels run if gradients are kept
     assert torch.allclose(found.tokens, tokens[0], atol=1e-5)
     assert torch.allclose(found.pooled, pooled[0], atol=1e-5)
     with pytest.raises(ValueError, match=r"expected tokens \(n, 4096\) and pooled \(768,\), found"):
@@ -208,7 +208,7 @@ def test_the_empty_prompt_is_the_stock_pipeline_s_and_lies_where_harmonize_looks
         read_prompt(path, tokens_width=TEXT, pooled_width=POOLED)
     assert main([*words, "--base", str(folder / "tokenizer")]) == 2
     assert "tokenizer: expected CLIPTokenizer in tokenizer/, found no such folder" in capsys.readouterr().err
-    # a hub id: in the user's cache, which is where `harmonize` looks
+    # a hub id, in the user's cache, from which `harmonize` loads
     for kind in (
         transformers.CLIPTokenizer,
         transformers.CLIPTextModel,

@@ -124,7 +124,7 @@ def test_baked_in_bfloat16_and_in_batches_finds_its_rows():
 def test_the_share_that_baking_saves_is_that_of_the_real_model():
     from diffusers import FluxTransformer2DModel
 
-    with torch.device("meta"):  # shapes alone
+    with torch.device("meta"):  # shapes only
         real = FluxTransformer2DModel(in_channels=192, out_channels=64)
     counts = {name: parameter.numel() for name, parameter in real.named_parameters()}
     gone = sum(n for name, n in counts.items() if ".linear." in name or "time_text_embed" in name)

@@ -129,7 +129,7 @@ def test_the_machine_does_not_make_a_result_stale(views):
 
 
 class Watched:
-    """A harmoniser, as its own options, that works only while the next view is read and the last one is written."""
+    """Harmoniser and its own options; it works only while the next view is read and the last one is written."""
 
     name = "watched"
 

@@ -39,7 +39,7 @@ def test_the_pipeline_edits_near_the_object_alone_with_one_seed_for_all_views(fo
     assert said[-1].startswith("edit: FluxKontextPipeline of ")
     assert said[-1].endswith("given the composite alone")
     assert harmonizer.settings["prompt"] == PROMPT
-    # the object is 10 pixels wide: what is more than 15 away is the composite's
+    # the object is 10 pixels wide: pixels more than 15 away are the composite's
     far = torch.zeros(64, 96, dtype=torch.bool)
     far[40:] = far[:, 40:] = True
     assert torch.equal(made[far], shown.composite[far])
@@ -90,7 +90,7 @@ def test_one_photo_is_harmonised_by_its_mask(folder, tmp_path, capsys):
     assert main([*words, "edit", "--model", str(folder), "--sampling-steps", "1"]) == 0
     assert not torch.equal(read_rgb(tmp_path / "out.png"), made)
     capsys.readouterr()
-    # what cannot be is one line, and the picture of before stays
+    # an impossible input gives one line, and the earlier picture stays
     before = (tmp_path / "out.png").read_bytes()
     write_image(mask, shown.mask[:20])
     assert main([*words, "--weights", str(flux)]) == 2

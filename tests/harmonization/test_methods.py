@@ -1,4 +1,4 @@
-"""Views of a composite, and methods by name: `none` keeps the prior, all views are harmonised as each alone."""
+"""Views of a composite, and methods by name: `none` keeps the prior, views are harmonised independently."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def cameras() -> Cameras:
 
 
 def scene() -> tuple[Gaussians, torch.Tensor]:
-    """A composite of 60 Gaussians, of which the last 20 are the object's."""
+    """Return a composite of 60 Gaussians; the last 20 are the object's."""
     whole = concatenate([spheres(40, 0, (0.2, 0.5, 0.7)), spheres(20, 1, (0.9, 0.3, 0.1))])
     return whole, torch.arange(60) >= 40
 

@@ -1,4 +1,4 @@
-"""Writes rendered pairs without Blender: a grey ball on a plane under a sun and uniform light, in closed form."""
+"""Rendered pairs without Blender: a grey ball on a plane under a sun and uniform light, in closed form."""
 
 import json
 import math
@@ -22,7 +22,7 @@ def sun(azimuth, height=0.8):
 
 
 def shaded(points, normals, albedo, light, *, ball):
-    """Linear radiance: albedo / pi times irradiance; the ball blocks the sun and part of the uniform light."""
+    """Return linear radiance: albedo / pi times irradiance; the ball blocks the sun and part of the uniform light."""
     towards = torch.tensor(light["direction"])
     cosine = (normals @ towards).clamp_min(0)
     away = CENTER - points
@@ -37,7 +37,7 @@ def shaded(points, normals, albedo, light, *, ball):
 
 
 def write_ball_pairs(folder: Path, *, seed: int = 0, pattern: str = "plain", cameras: int = 2) -> None:
-    """One scene with one object and two lights, as the render worker leaves it."""
+    """Write one scene with one object and two lights, like the render worker."""
     turns = [0.6 * i + seed for i in range(cameras)]
     eyes = torch.tensor([[2 * math.cos(t), 2 * math.sin(t), 1.1] for t in turns])
     poses = look_at(eyes, torch.tensor([0.0, 0, 0.2]), torch.tensor([0.0, 0, 1]))

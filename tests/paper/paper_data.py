@@ -1,4 +1,4 @@
-"""A folder laid out as `paper tables` reads it, with pictures of the shipped benchmark scene."""
+"""A folder in the layout of `paper tables`, with pictures of the shipped benchmark scene."""
 
 import shutil
 from pathlib import Path
@@ -7,14 +7,14 @@ from splatgraft.core.images import read_mask, read_rgb, write_image
 
 TERRACE = Path(__file__).parents[2] / "data" / "benchmark" / "terrace"
 STEMS = tuple(f"{index:04d}" for index in range(17))
-"""So many views that 3 are held out."""
+"""Number of views; 3 of them are held out."""
 PLAIN = "bathtub_57e_in_blend_57eadb"
 OTHER = "sink_in_blend_92e6c7"
 REAL = "truck_in_garden"
 
 
 def parts_of_view(stem):
-    """Truth, background, mask and a pasted composite of one view."""
+    """Return truth, background, mask and a pasted composite of one view."""
     truth = read_rgb(TERRACE / "ground_truth" / "images" / f"{stem}.png")
     background = read_rgb(TERRACE / "target" / "images" / f"{stem}.png")
     mask = read_mask(TERRACE / "ground_truth" / "masks" / f"{stem}.png")
@@ -23,7 +23,7 @@ def parts_of_view(stem):
 
 
 def write_data(root):
-    """Scenes of all three kinds, with the authors' pictures."""
+    """Write scenes of all three kinds, with the authors' pictures."""
     synthetic, results = root / "data_3d/synthetic/insertions", root / "results_3d"
     rotation = root / "data_rotation/bathroom"
     for stem in STEMS:
@@ -49,6 +49,6 @@ def write_data(root):
 
 
 def put(path, image):
-    """Write a picture into a folder that may not be there yet."""
+    """Write a picture into a folder, which is made if necessary."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_image(path, image)

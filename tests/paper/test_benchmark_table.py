@@ -37,7 +37,7 @@ def test_the_interval_holds_the_mean_and_shrinks_to_a_point_for_one_scene():
     assert min(values) <= found.low < found.mean < found.high <= max(values)
     assert summarize([3.0]).low == summarize([3.0]).high == 3.0
     assert summarize([None, math.nan]) is None
-    # the deviation of a mean of n values is theirs over sqrt(n): 1.96 of them on both sides hold 95%
+    # the deviation of a mean of n values is theirs over sqrt(n); 1.96 of them on both sides hold 95%
     many = np.random.default_rng(0).normal(size=400)
     wide = summarize(list(many))
     assert abs((wide.high - wide.low) / (2 * 1.96 * many.std() / 20) - 1) < 0.05
@@ -111,7 +111,7 @@ def test_an_error_counts_in_its_own_region_only():
 
 
 def wall_cameras():
-    """Two cameras side by side that look straight at a wall 2 away; 0.1 m between them is 4 px."""
+    """Return two cameras side by side that look straight at a wall 2 away; 0.1 m between them is 4 px."""
     poses = torch.eye(4).repeat(2, 1, 1)
     poses[1, 0, 3] = 0.1
     intrinsics = torch.tensor([[80.0, 0, 32], [0, 80.0, 24], [0, 0, 1]]).repeat(2, 1, 1)

@@ -37,7 +37,7 @@ WHITE, GREY = Material("plain", (0.8, 0.8, 0.8)), Material("plain", (0.4, 0.4, 0
 
 
 def floor_scene(*, lamps=(), world=None):
-    """A grey floor at z = 0 under dim even light."""
+    """Return a grey floor at z = 0 under dim even light."""
     floor = Part("box", (8, 8, 0.1), (0, 0, -0.05), GREY)
     return Scene(
         name="floor",
@@ -61,7 +61,7 @@ def rendered(job, out):
 
 @pytest.fixture(scope="module")
 def pair_folder(tmp_path_factory):
-    """Scene 0 of the training pairs: five cameras, one object, one light."""
+    """Render scene 0 of the training pairs: five cameras, one object, one light."""
     out = tmp_path_factory.mktemp("pairs")
     job = pairs.plan(pairs.PairPlan(objects=1, lights=1, size=TINY), 0)
     return rendered(job, out / pairs.job_folder_name(job))
@@ -109,7 +109,7 @@ def test_masks_and_depths_lie_where_the_poses_project_known_points(tmp_path):
 
 @pytest.mark.long
 def test_a_scene_lit_from_the_left_has_its_shadow_on_the_right(tmp_path):
-    # the camera stands at -y and looks along +y, so that +x is right in the picture
+    # the camera is at -y and looks along +y, so +x is right in the picture
     cameras = (Camera((0, -3, 1.6), (0, 0, 0.2), 0.9),)
     takes = (Take("without", scene=True), Take("with", scene=True, object="ball", passes=("color", "mask")))
     sides = {}
@@ -177,7 +177,7 @@ def test_a_benchmark_scene_is_laid_out_sound_with_its_true_light(tmp_path):
     assert benchmark.find_defect(out) is None
     truth, place = read_capture(out / "ground_truth"), make_scene(which.kind, which.seed).places[0]
     assert truth.cameras.names == read_capture(out / "target").cameras.names
-    # sparse points are where surfaces are: the support under the object among them, within noise (0.2% of 3 m)
+    # sparse points lie on surfaces, also on the support under the object, within noise (0.2% of 3 m)
     points = read_capture(out / "target").points
     top = points[(points[:, :2] - torch.tensor(place.location[:2])).norm(dim=1) < place.radius, 2]
     assert abs(float(top.median()) - place.location[2]) < 0.03
@@ -192,7 +192,7 @@ def test_a_benchmark_scene_is_laid_out_sound_with_its_true_light(tmp_path):
     assert np.load(out / "old_light" / "0000.npy").min() >= 0
     surface = np.load(out / "surface.npy")
     assert np.allclose(np.linalg.norm(surface[:, 3:], axis=1), 1, atol=1e-5)  # float32
-    # its normals point outward: on the whole away from the object's axis
+    # its normals point outward: mostly away from the object's axis
     flat = surface[:, :2] - place.location[:2]
     assert (flat * surface[:, 3:5]).sum(1).mean() > 0
     assert abs(float(surface[:, 2].min()) - place.location[2]) < 0.03  # a blob is sunk by 4% of its height
@@ -233,7 +233,7 @@ def test_a_sun_lamp_is_listed_and_its_disc_is_not_in_the_panorama(tmp_path):
     out = rendered(job, tmp_path / "out")
     assert len(json.loads((out / "light" / "suns.json").read_text())) == 1
     panorama = np.load(out / "light" / "0000.npy")
-    # the upper half is an even sky: nothing in it is brighter than the rest by more than noise
+    # the upper half is an even sky: only noise makes a pixel brighter than the others
     sky = panorama[:28].max(-1)
     assert sky.max() < 1.5 * np.median(sky)
 

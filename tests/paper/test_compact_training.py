@@ -33,7 +33,7 @@ NOTHING = HeldOutOptions(materials=(), lights=(), every=0)
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
-    """Two scenes and the priors of their pairs."""
+    """Make two scenes and the priors of their pairs."""
     root = tmp_path_factory.mktemp("pairs")
     for number, pattern in enumerate(("plain", "brick")):
         write_ball_pairs(root / f"ball_{number}", seed=number, pattern=pattern)
@@ -53,7 +53,7 @@ def silent(*words):
 
 def test_under_the_true_light_the_prior_removes_most_of_the_error(rendered, tmp_path, monkeypatch):
     monkeypatch.setattr(priors, "perturb_light", lambda light, rng: light)
-    # of an estimated light less is applied
+    # less of an estimated light is applied
     monkeypatch.setattr(priors, "shade_ratio", partial(shade_ratio, settings=KNOWN_LIGHTS))
     priors.write_priors([rendered / "ball_0"], tmp_path / "priors", seed=0)
     pairs = CompactPairs(rendered, [tmp_path / "priors"], NOTHING)
@@ -61,8 +61,8 @@ def test_under_the_true_light_the_prior_removes_most_of_the_error(rendered, tmp_
     for index in range(4):
         view, truth = pairs.read(index)
         pasted, prior = region_errors(view.composite, truth, view), region_errors(view.prior(), truth, view)
-        # what is left: normals with errors of 12 degrees, edges of a shadow a few pixels wide, and the light that
-        # the ball reflects, which the closed form leaves out
+        # the remaining error: normals off by 12 degrees, edges of a shadow a few pixels wide, and the light that
+        # the ball reflects, which the closed form omits
         assert prior["object"] < 0.4 * pasted["object"]
         assert prior["shadow"] < 0.6 * pasted["shadow"]
 
@@ -79,7 +79,7 @@ def test_perturbed_lights_stay_within_their_bounds_and_differ():
     ratios = [s.irradiance[0] / 3.0 for s in kept]
     assert max(ratios) < 4 * math.exp(1.4) * 1.3
     assert max(ratios) > 2
-    # the uncertainty is calibrated: larger errors where it is larger
+    # the uncertainty is calibrated: larger errors at larger values
     uncertainties = np.array([s.uncertainty_deg for s in kept])
     assert np.mean(np.array(angles)[uncertainties > 12]) > 2 * np.mean(np.array(angles)[uncertainties < 8])
 
@@ -149,7 +149,7 @@ def test_it_learns_its_training_pairs(rendered, tmp_path):
             _, found, prior = compact_loss(view, output, truth)
         assert apply_output(view, output).min() >= 0
         before, after = before + float(prior["object"]), after + float(found["object"])
-    # cuts and exposures are others than those trained on; a third of the error is far beyond chance
+    # cuts and exposures differ from the training; a third of the error is far beyond chance
     assert after < 0.65 * before
 
 
@@ -167,7 +167,7 @@ def test_the_command_makes_weights_that_the_harmoniser_loads(rendered, tmp_path,
     assert (tmp_path / "priors" / "0" / "ball_0.npz").stat().st_mtime_ns == before
     one, other = (read_weights(path) for path in (weights, tmp_path / "again" / "compact.safetensors"))
     assert one.size == other.size
-    # two steps at the end of a schedule from where the first ended: near it, and not it
+    # two steps at the end of a schedule, from the end of the first: near it, but not equal
     apart = [(a - b).abs().max() for a, b in zip(one.state_dict().values(), other.state_dict().values(), strict=True)]
     assert 0 < max(apart) < 0.01
     assert "4 pairs to train on, 4 held out" in capsys.readouterr().err
@@ -175,7 +175,7 @@ def test_the_command_makes_weights_that_the_harmoniser_loads(rendered, tmp_path,
 
 @pytest.fixture(scope="module")
 def shipped(tmp_path_factory):
-    """Ten of the shipped pairs with their priors."""
+    """Return ten of the shipped pairs with their priors."""
     folder, out = Path(__file__).parents[2] / "data" / "pairs", tmp_path_factory.mktemp("shipped")
     priors.write_priors([folder / "kitchen_0001_00001"], out, seed=0)
     return CompactPairs(folder, [out], NOTHING)
@@ -185,7 +185,7 @@ def shipped(tmp_path_factory):
 def test_the_shipped_pairs_are_read_with_their_light(shipped):
     assert len(shipped.training) == 10
     view, truth = shipped.read(0)
-    # wherever the object is not and casts nothing, background and truth are one render but for its noise
+    # away from the object and its shadow, background and truth are one render except for noise
     far = (view.mask == 0) & (view.log_ratio.abs().sum(1, keepdim=True) == 0)
     assert float((view.background - truth).abs().mean(1, keepdim=True)[far].median()) < 0.02
     assert 0 < view.prior_confidence < 1
@@ -193,7 +193,7 @@ def test_the_shipped_pairs_are_read_with_their_light(shipped):
 
 @pytest.mark.long
 def test_the_shipped_weights_are_those_of_a_training(shipped):
-    # these pairs were trained on: this tells that the file is whole and fits its features, not how good it is
+    # the network was trained on these pairs: this shows that the file is intact and fits its features, not its quality
     network = read_weights(SHIPPED)
     assert SHIPPED.stat().st_size < 10e6
     before = after = 0.0

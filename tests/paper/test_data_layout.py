@@ -1,4 +1,4 @@
-"""What is found in the authors' data set, the paper's numbers, and metrics by what is known of a view."""
+"""The contents of the authors' data set, the paper's numbers, and the metrics that a view's files allow."""
 
 import huggingface_hub
 import pytest

@@ -18,7 +18,7 @@ MAPS = [Path("/maps/a map.hdr"), Path("/maps/it's.hdr"), Path("/maps/c.hdr")]
 
 
 def merged(defaults, dotlist):
-    """As OmegaConf merges a dotlist into a configuration; it reads values as YAML."""
+    """Merge a dotlist into a configuration like OmegaConf, which reads values as YAML."""
     given = dict(word.split("=", 1) for word in dotlist)
     assert set(given) <= set(defaults), f"no such key: {set(given) - set(defaults)}"
     return defaults | {key: yaml.safe_load(value) for key, value in given.items()}
@@ -44,7 +44,7 @@ def test_the_programs_take_our_command_lines():
     assert config["save_image"]
 
 
-# Stand-ins of the programs: what they read, print, load and write is that of the recorded versions; they darken by the
+# Stand-ins of the programs: they read, print, load and write the same as the recorded versions. They darken by the
 # number of the light instead of rendering.
 _SVD = """
 import argparse, json, pathlib, sys
@@ -92,7 +92,7 @@ if __name__ == "__main__":
 
 @pytest.fixture
 def python(tmp_path):
-    """Quick to start, and "import torch" does not load it."""
+    """Write a program that starts quickly, because "import torch" does not load torch."""
     path = tmp_path / "python"
     path.write_text(f'#!/bin/sh\n[ "$1" = -c ] && exit 0\nexec {sys.executable} "$@"\n')
     path.chmod(path.stat().st_mode | stat.S_IXUSR)
@@ -108,7 +108,7 @@ def installation(folder, how=lambda text: text):
 
 
 def drafts(count):
-    """Smooth pictures with a mask each."""
+    """Write smooth pictures with a mask each."""
     g = torch.Generator().manual_seed(0)
     return [(torch.rand(1, 1, 3, generator=g).expand(48, 80, 3), torch.ones(48, 80)) for _ in range(count)]
 
@@ -136,7 +136,7 @@ def test_many_pictures_and_lights_load_each_model_once(tmp_path, python):
 
 def test_a_picture_that_the_models_cannot_take_is_padded_and_not_stretched(tmp_path, python):
     renderer, lights = DiffusionRenderer(installation(tmp_path / "code"), python), maps(tmp_path / "maps", 1)
-    # 50 rows, of which stretching to 64 would mix neighbours
+    # 50 rows; stretching them to 64 would mix neighbours
     stripes = (torch.arange(50) % 2).float()[:, None, None].expand(50, 70, 3).contiguous()
     (relit,) = renderer.relight(stripes, torch.ones(50, 70), lights)
     assert torch.equal(relit, stripes)

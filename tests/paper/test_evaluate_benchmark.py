@@ -1,4 +1,4 @@
-"""`paper benchmark` on the shipped scene: what is measured is held out, what cannot run is said, the light helps."""
+"""`paper benchmark` on the shipped scene: measured views are held out, missing methods are named, the light helps."""
 
 import json
 import shutil
@@ -20,7 +20,7 @@ BETTER = replace(QUICK, iterations=300, budget=8000)
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """A command that ran once: one of our methods, the truth as another program's, one that cannot."""
+    """Run a command once: one of our methods, the truth as another program's, and one that cannot run."""
     out = tmp_path_factory.mktemp("benchmark")
     (out / "theirs").mkdir()
     shutil.copytree(SCENES / "terrace" / "ground_truth" / "images", out / "theirs" / "terrace")
@@ -55,7 +55,7 @@ def test_the_truth_as_another_programs_pictures_has_no_error_left(measured):
     values, _ = rows(measured)
     assert values["truth"]["ssim_whole"] == pytest.approx(1)
     assert values["truth"]["disagreement"] == values["truth"]["disagreement_truth"]
-    # as 3DGS's render.py numbers the held-out views, which GS-IR, GaussianShader and 3DGS-DR keep
+    # numbers of held-out views by 3DGS's render.py, which GS-IR, GaussianShader and 3DGS-DR keep
     assert values["GS-IR"]["ssim_whole"] == pytest.approx(1)
     # an infinite PSNR has no number
     assert values["truth"]["psnr_whole"] is None

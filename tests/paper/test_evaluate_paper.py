@@ -28,7 +28,7 @@ from splatgraft_paper.training.pairs import DataOptions, open_training_data
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """The command, run with --measure-only."""
+    """Run the command with --measure-only."""
     root = tmp_path_factory.mktemp("published")
     command = EvaluatePaper(write_data(root / "dot3d_data").parent, root / "out", measure_only=True)
     assert command.execute(Console()) == 0
@@ -115,7 +115,7 @@ def test_a_second_run_measures_nothing_again(measured):
 
 
 def write_placed_scene(root):
-    """A table and a ball of Gaussians that already stands on it, with cameras, and the composite as the truth."""
+    """Return a table and a ball of Gaussians that already is on it, with cameras, and the composite as the truth."""
     generator = torch.Generator().manual_seed(0)
     table = torch.cat([4 * torch.rand(400, 2, generator=generator) - 2, torch.zeros(400, 1)], 1)
     up = torch.tensor([0.0, 0.0, 1.0])
@@ -137,7 +137,7 @@ def write_placed_scene(root):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Every table at toy size: tiny weights of the harmoniser, random ones of LPIPS."""
+    """Make every table at toy size: tiny weights of the harmoniser, random ones of LPIPS."""
     pytest.importorskip("diffusers")
     root = tmp_path_factory.mktemp("whole")
     (root / "weights").mkdir()
@@ -163,7 +163,7 @@ def test_our_methods_run_on_a_composite_that_is_already_placed(whole):
     rows, found = by_scene_and_method(whole)
     assert found["missing"] == []
     assert {"copy-paste", "off+flux/paper", "off+flux/paper-l1-dssim", "off+flux/paper@linear"} <= {m for _, m in rows}
-    # the truth is a render of the same Gaussians, but for the table, which compose presses flat under the ball's foot
+    # the truth renders the same Gaussians, except for the table, which compose flattens under the ball's foot
     assert rows[PLAIN, "copy-paste"]["values"]["psnr_whole"] > 40
     assert rows[PLAIN, "copy-paste"]["values"]["lpips_whole"] is not None
     assert rows[PLAIN, "off+flux/paper"]["seconds"]["consolidate"] > 0
@@ -180,7 +180,7 @@ def test_the_ablation_of_the_data_is_measured_on_each_source_s_test_split(whole)
     _, found = by_scene_and_method(whole)
     assert set(found["by_model"]) == {"Ours", "w/o Flux", "mine"}
     assert found["by_model"]["Ours"] == found["by_model"]["mine"]
-    # numpy beside it, on the one held-out pair of three scenes
+    # numpy computes it again, on the one held-out pair of three scenes
     data = open_training_data(DataOptions(generated=whole.generated, size="32x32"), 0, None)
     (pair, *rest) = data.held_out.all()
     read = [files.read() for files in (pair, *rest)]
@@ -211,7 +211,7 @@ def test_costs_come_from_the_records_of_the_steps_and_a_dash_has_its_reason(whol
     lines = {line.split(" | ")[0].strip("| "): line for line in table(whole, "Computational cost") if "|" in line}
     spent = rows[PLAIN, "off+flux/paper"]["seconds"]["harmonize"] / 60
     assert lines["harmonize"] == f"| harmonize | 12.50 | {spent:.2f} |"
-    # the scene came reconstructed
+    # the scene was already reconstructed
     assert lines["segment"] == "| segment | 0.67 | – (no method that ran has this step) |"
     losses = table(whole, "Perceptual against photometric")
     assert any(line.startswith("| stand-in for LPIPS: off+flux/paper, run here |") for line in losses)

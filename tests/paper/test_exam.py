@@ -1,4 +1,4 @@
-"""The exam draws its scenes from its number alone, away from all known seeds, and its figures are what they say."""
+"""The exam draws its scenes from its number alone, away from all known seeds, and its figures are correct."""
 
 import math
 from dataclasses import replace
@@ -67,7 +67,7 @@ def test_errors_of_a_light_of_double_strength_are_one_stop_of_level():
 def test_a_turned_light_is_off_by_its_angle():
     angle = math.radians(30)
     turned = replace(LIGHT, sources=(replace(SUN, direction=(math.sin(angle), 0.0, math.cos(angle))),))
-    # 10,000 directions are 2 degrees apart, so that each of both is off by at most 1.5
+    # 10,000 directions are 2 degrees apart, so both are off by at most 1.5
     assert light_errors(turned, LIGHT)["direction_deg"] == pytest.approx(30, abs=3)
 
 
@@ -84,7 +84,7 @@ def test_what_lies_inside_of_an_object_is_not_its_surface():
     ball, core = torch.cat([0.2 * around, around], 1), torch.cat([0.17 * around[::2], around[::2]], 1)
     inner = torch.cat([0.19 * around, -around], 1)  # the inner wall of a hollow ball
     seen = seen_surface(torch.cat([ball, core, inner]), ring(12))
-    # the cameras stand above the middle: of the ball a cap around the lower pole is unseen
+    # the cameras are above the middle: a cap around the ball's lower pole is unseen
     assert 0.7 * len(ball) < len(seen) < len(ball)
     assert float(seen[:, :3].norm(dim=1).min()) > 0.199
 
@@ -107,7 +107,7 @@ def test_fitted_colours_make_the_true_shadow_in_views_they_were_not_fitted_to():
     points = torch.stack([x.flatten(), y.flatten(), torch.zeros(x.numel())], 1)
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(points), 3)
     in_shadow = (points[:, 0] > 0.2) & (points[:, 0] < 0.9) & (points[:, 1].abs() < 0.3)
-    # what the transfer cannot know: a shadow beside the object, under a light that makes none there
+    # a case that the transfer cannot know: a shadow beside the object, under a light that makes none there
     bright, dark = (surfels(points, up, width=0.04, srgb=shade) for shade in (0.6, 0.3))
     shadowed = replace(bright, sh=torch.where(in_shadow[:, None, None], dark.sh, bright.sh))
     around = even_directions(300)

@@ -1,4 +1,4 @@
-"""Each equation of the paper's training against numpy in float64, written from the paper and from nothing here."""
+"""Each equation of the paper's training, compared with numpy in float64, written from the paper alone."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ pytestmark = [*quiet, pytest.mark.filterwarnings("ignore::UserWarning")]
 
 
 def soft_edged(folder, kind):
-    """A folder of one pair whose object has soft edges; the relit object is RGBA with straight alpha."""
+    """Return a folder of one pair whose object has soft edges; the relit object is RGBA with straight alpha."""
     rng, side = np.random.default_rng(0), 32
     y, x = np.mgrid[:side, :side]
     mask = np.clip((11 - np.hypot(x - 15.5, y - 15.5)) / 4, 0, 1)  # covers edges of four pixels
@@ -69,7 +69,7 @@ def test_a_composite_is_equation_2_at_every_pixel(tmp_path, kind):
 
 
 class Recorder:
-    """In place of a network: keeps what it is given and answers with known numbers."""
+    """Stand-in for a network: keeps its input and answers with known numbers."""
 
     config = SimpleNamespace(guidance_embeds=False)
 
@@ -83,7 +83,7 @@ class Recorder:
 
 
 def unpacked(tokens, height, width):
-    """FLUX's tokens to latents in numpy: token (i, j) holds 2 x 2 pixels, channel by channel."""
+    """Return FLUX's tokens as latents in numpy: token (i, j) holds 2 x 2 pixels, channel by channel."""
     b, _, d = tokens.shape
     latents = np.zeros((b, d // 4, height, width))
     for i in range(height):
@@ -94,7 +94,7 @@ def unpacked(tokens, height, width):
 
 
 def flux_loss(tmp_path, times, samples, **options):
-    """The loss of random latents, with all that reached the network, in numpy."""
+    """Return the loss of random latents, with all inputs of the network, in numpy."""
     run = training(tmp_path, "out", QUICK, times=times, **options)
     generator = torch.Generator().manual_seed(5)
     roles, size = run.task.objective.roles, (samples, 4, 4, 4)
@@ -150,7 +150,7 @@ def test_times_are_distributed_as_their_option_says(tmp_path):
 
     uniform = drawn("uniform")
     assert uniform.min() > 0
-    # seeds are fixed: these are the probabilities of such a deviation, not a chance of failing
+    # seeds are fixed, so these are the probabilities of such a deviation, not of a random failure
     assert kstest(uniform, "uniform").pvalue > 0.01
     levels, counts = np.unique(drawn("schnell"), return_counts=True)
     assert np.array_equal(levels, [0.25, 0.5, 0.75, 1.0])
@@ -177,7 +177,7 @@ def test_the_first_layer_is_repeated_as_the_paper_says_or_starts_blind_to_condit
 
 
 class Squares(ObjectiveTask):
-    """A linear layer whose squares are made small."""
+    """Linear layer with squares that the training minimises."""
 
     def __init__(self, options):
         self.network, self.fingerprint, self._options = torch.nn.Linear(6, 3), {}, options

@@ -1,4 +1,4 @@
-"""Recipes hold the paper's numbers, are printed before anything is loaded, and give way to the user's own options."""
+"""Recipes hold the paper's numbers, are printed before anything is loaded, and the user's own options override them."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -82,7 +82,7 @@ def test_a_plan_says_what_will_run_and_loads_nothing(tmp_path, capsys):
     ):
         assert line in printed
     assert not (tmp_path / "out").exists()
-    # the user's own words replace those of the recipe
+    # the user's options override those of the recipe
     assert main([*words, "--steps", "10", "--batch", "8"]) == 0
     assert "plan: 10 steps of 8 pairs" in capsys.readouterr().err
     assert main(["paper", "train", "removal", str(tmp_path / "out"), "--recipe", "removal", "--plan"]) == 0

@@ -1,4 +1,4 @@
-"""Several real processes (torchrun, gloo, CPU) train as one, split or not; a state goes on in any number of them."""
+"""Several real processes (torchrun, gloo, CPU) train as one, sharded or not; any number of them resumes a state."""
 
 import json
 import os
@@ -38,7 +38,7 @@ def run(folder, processes, *runs):
 
 
 def seen(folder, name, processes):
-    """What each process saw; there were as many as wanted, which exchanged gradients."""
+    """Return what each process recorded, and check their number and that they exchanged gradients."""
     found = [json.loads((folder / name / f"process_{rank}.json").read_text()) for rank in range(processes)]
     assert [one["processes"] for one in found] == [processes] * processes
     assert {one["backend"] for one in found} == ({"gloo"} if processes > 1 else {None})
@@ -51,7 +51,7 @@ def losses(folder, name):
 
 def assert_near(folder, one, other):
     # the same pairs and noise, sums in another order: float32 rounds at 6e-8, and Adam's division by the root of small
-    # second moments makes more of it, up to a share of a step of 1e-3
+    # second moments enlarges it, up to a share of a step of 1e-3
     assert torch.allclose(losses(folder, one), losses(folder, other), rtol=1e-4)
     first, second = load_file(folder / one / MODEL), load_file(folder / other / MODEL)
     assert set(first) == set(second)
@@ -69,7 +69,7 @@ def until(step):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Trainings in one, two and three processes; loading the libraries takes most of their time."""
+    """Run trainings in one, two and three processes; loading the libraries takes most of their time."""
     folder = tmp_path_factory.mktemp("processes")
     for inside in ("", "vanishing"):
         flux_folder(folder / inside / "base")
@@ -135,7 +135,7 @@ def test_a_picture_that_vanished_ends_all_processes_with_the_same_line(folder):
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_sigterm_saves_the_state_and_the_same_command_goes_on(folder, processes):
-    """As SLURM ends a job that is preempted."""
+    """End a process like SLURM ends a preempted job."""
     out = folder / f"ended{processes}"
     words = ["paper", "train", "flux", str(out), "--base", str(folder / "base"), "--generated", str(folder / "pairs")]
     words += ["--size", "32x32", "--batch", "2", "--precision", "no", "--cpu", "--save-every", "100000"]

@@ -13,7 +13,7 @@ from splatgraft_paper.synthesis.jobs import RenderWorkers
 
 
 def write_sample(folder, seed=0):
-    """A folder as the worker leaves it: one camera, one object, one light, 48x40."""
+    """Write a folder like the worker's: one camera, one object, one light, 48x40."""
     g = torch.Generator().manual_seed(seed)
     background = torch.rand(40, 48, 3, generator=g) * 0.5 + 0.2
     mask = torch.zeros(40, 48)
@@ -79,6 +79,6 @@ def test_the_paper_s_amount_is_1900_targets_and_a_little_over_51000_composites_a
     assert "pairs: 1,900 targets, 51,300 composites (the paper: 1,900 and 51,000, --paper); about " in said
     assert main(["paper", "synth", "pairs", str(tmp_path / "out")]) == 2
     assert "pairs: 600 targets, 1,800 composites" in capsys.readouterr().err
-    # Sec. 5.2: 704x496 with 128 samples, of which one picture of a room takes 336 CPU seconds
+    # Sec. 5.2: 704x496 with 128 samples; one picture of a room takes 336 CPU seconds
     plan = pairs.PairPlan(objects=2, lights=0)
     assert plan.cpu_seconds == pytest.approx(15 * 336, rel=0.02)

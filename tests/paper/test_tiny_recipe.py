@@ -1,4 +1,4 @@
-"""The recipe `tiny`: its pairs in closed form, its base model of the real classes, and the whole road to a view."""
+"""The recipe `tiny`: its pairs in closed form, its base model of the real classes, and the whole way to a view."""
 
 from dataclasses import replace
 
@@ -30,7 +30,7 @@ def test_spheres_differ_by_the_object_and_what_it_does_to_the_light():
     assert 20 < soft.sum() < 200
     changed = (shown.target - shown.background).abs().amax(-1)
     assert changed[shown.mask == 1].mean() > 0.05
-    # a shadow only darkens, and most of the picture has none
+    # a shadow only darkens, and the larger part of the picture has no shadow
     outside = shown.mask == 0
     assert (shown.target[outside] <= shown.background[outside] + 1e-6).all()  # float32
     assert 0.005 < (changed[outside] > 0.02).float().mean() < 0.3
@@ -56,7 +56,7 @@ def test_the_tiny_base_is_flux_of_three_million_weights(tmp_path):
     assert 2.5e6 < count < 4.5e6
     latents = objective.autoencoder.encode(torch.stack(pictures))
     assert latents.shape == (6, 16, 12, 16)
-    # the shift and scale are those of these very pictures
+    # shift and scale are computed from these pictures
     assert abs(float(latents.mean())) < 0.01
     assert abs(float(latents.std()) - 1) < 0.01
     with torch.no_grad():
@@ -66,7 +66,7 @@ def test_the_tiny_base_is_flux_of_three_million_weights(tmp_path):
 
 @pytest.mark.long
 def test_the_tiny_autoencoder_learns_colours(tmp_path):
-    """With the rate of Adam four times as high it shows every picture gray: 96% of the variance is left, now 22%."""
+    """Colours are reproduced: 22% of the variance is left. At four times the rate of Adam all are gray, 96%."""
     colors = torch.rand(64, 3, generator=torch.Generator().manual_seed(0))
     pictures = list(colors[:, :, None, None].expand(-1, -1, 16, 16))
     errors = []
@@ -90,7 +90,7 @@ def pairs(folder, scenes, seed):
 
 
 def harmonised(folder, training, base, loop):
-    """A harmoniser that the recipe trained on pairs."""
+    """Return a harmoniser that the recipe trained on pairs."""
     pictures = []
     for files in training[::3]:
         pair = files.read()
@@ -124,7 +124,7 @@ def test_the_trained_harmoniser_brings_unseen_scenes_nearer_to_the_truth(tmp_pat
     for files in pairs(tmp_path / "unseen", 16, 1)[::3]:
         pair = files.read()
         result = harmonizer.harmonize(view_of(pair)).image
-        # what differs between composite and truth is the object's light and its shadow
+        # composite and truth differ by the object's light and its shadow
         wrong = (pair.composite - pair.target).abs().amax(-1) > 0.05
         regions = (None, pair.mask > 0.5, wrong)
         gains.append(

@@ -44,7 +44,7 @@ def inputs(sample):
 
 
 def one_shipped_pair(tmp_path):
-    """The first of the rendered pairs that ship with the repository."""
+    """Return the first of the rendered pairs that ship with the repository."""
     shipped, folder = Path(__file__).parents[2] / "data" / "pairs", tmp_path / "shipped"
     folder.mkdir()
     line = (shipped / "manifest.jsonl").read_text().splitlines()[0]
@@ -201,7 +201,7 @@ def test_a_pair_whose_loss_is_no_number_is_named_and_the_step_before_is_kept(tmp
         run.train()
     assert {p.name for p in (tmp_path / "out" / "states").iterdir()} == {f"{step:08d}"}
     whole = training(tmp_path, "whole", replace(loop, steps=step), pairs=6).train()
-    # the state that is kept is that of the last good step, to the bit
+    # the kept state is that of the last good step, bit for bit
     loaded.paths["composite"].unlink()
     kept = training(tmp_path, "out", replace(loop, steps=step), pairs=6).train()
     assert (kept / WEIGHTS).read_bytes() == (whole / WEIGHTS).read_bytes()
@@ -220,7 +220,7 @@ def test_a_picture_that_vanished_is_one_line_and_leaves_a_state_and_no_open_file
         warnings.simplefilter("always", ResourceWarning)
         with pytest.raises(ValueError, match=r"relit_0.png: expected a picture of a pair, found No such file"):
             replace(run, progress=remove).train()
-        gc.collect()  # a file that was left open is found when it is collected
+        gc.collect()  # an open file is found when it is collected
     assert not [warning for warning in found if issubclass(warning.category, ResourceWarning)]
     (state,) = list_states(tmp_path / "out")
     assert int(state.name) >= 3
@@ -317,5 +317,5 @@ def test_what_validation_measured_is_what_is_saved(tmp_path, kind):
     read, trained = model.from_pretrained(run.train() / kind).state_dict(), run.task.network.state_dict()
     assert set(read) == set(measured)
     assert all(torch.equal(read[name], measured[name]) for name in read)
-    # the last weights are others than their average
+    # the last weights differ from their average
     assert sum(not torch.equal(read[name], trained[name]) for name in read) > len(read) / 2

@@ -41,7 +41,7 @@ from splatgraft_paper.training.relighters import StandInRelighter
 
 
 def environment(folder: Path, name: str, bright: str) -> Path:
-    """A map whose light comes from one side."""
+    """Return a map with light from one side."""
     picture = np.full((16, 32, 3), 0.05, np.float32)
     left, right = slice(16, 31), slice(1, 16)  # phi from the camera's back over its right
     picture[4:10, right if bright == "right" else left] = 10.0
@@ -57,7 +57,7 @@ def test_each_picture_has_a_key_of_its_own_and_a_light_changes_the_composite_alo
     one, other = relit.pairs
     assert one.key("target") == other.key("target")
     assert one.key("composite") != other.key("composite")
-    # the composite is made of all four pictures: another of any of them makes another composite
+    # the composite depends on all four pictures: changing one of them changes it
     for path in (one.relit, one.target, one.background, one.mask):
         before = {role: one.key(role) for role in ("composite", "target", "background", "mask")}
         os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
@@ -133,7 +133,7 @@ def test_the_choice_of_photographs_is_balanced():
         Photograph(Path(f"{o}{s}{i}.jpg"), Path("m"), Path("b"), f"o{o}", f"s{s}")
         for o in range(6)
         for s in range(5)
-        for i in range(3 + 10 * (o == 0))  # one object has many more
+        for i in range(3 + 10 * (o == 0))  # one object has many more pictures
     ]
     chosen = choose_balanced(photographs, 60, 0)
     assert len(set(chosen)) == 60

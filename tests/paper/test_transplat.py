@@ -51,7 +51,7 @@ def test_an_even_sky_of_twice_the_light_doubles_every_color_and_more_is_limited(
 
 
 def sky(bright, dark, radius=20.0):
-    """A shell around the origin, `bright` where y > 0 and `dark` elsewhere (sRGB)."""
+    """Return a shell around the origin, `bright` for y > 0 and `dark` elsewhere (sRGB)."""
     points = unit(6000, seed=1)
     color = torch.where(points[:, 1:2] > 0, torch.tensor(bright), torch.tensor(dark)).expand(-1, 3)
     return surfels(points * radius, -points, width=1.2, srgb=color)

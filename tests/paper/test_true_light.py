@@ -1,4 +1,4 @@
-"""The true light of a rendered panorama lights surfaces as the panorama itself does, and has its suns as sources."""
+"""The true light of a rendered panorama lights surfaces like the panorama itself, and has its suns as sources."""
 
 import math
 
@@ -13,7 +13,7 @@ SUN = torch.nn.functional.normalize(torch.tensor([0.4, 0.5, 0.76]), dim=0)
 
 
 def pixels():
-    """Directions and solid angles: row 0 is up, the middle column +x, to the right -y."""
+    """Return directions and solid angles: row 0 is up, the middle column +x, to the right -y."""
     polar = (torch.arange(H) + 0.5) / H * math.pi
     azimuth = -2 * math.pi * ((torch.arange(W) + 0.5) / W - 0.5)
     x, y = polar.sin()[:, None] * azimuth.cos(), polar.sin()[:, None] * azimuth.sin()
@@ -22,7 +22,7 @@ def pixels():
 
 
 def day(*, sky: float, sun: float, radius_deg: float):
-    """A bright sky over a dark ground, and a round sun."""
+    """Return a bright sky over a dark ground, and a round sun."""
     directions, _ = pixels()
     gray = torch.where(directions[..., 2] > 0, sky, 0.2)
     gray = torch.where(directions @ SUN > math.cos(math.radians(radius_deg)), sun, gray)
@@ -30,7 +30,7 @@ def day(*, sky: float, sun: float, radius_deg: float):
 
 
 def lit_by(panorama, normals):
-    """Irradiance by summing all pixels."""
+    """Return irradiance as the sum over all pixels."""
     directions, solid_angles = pixels()
     cosine = (normals @ directions.reshape(-1, 3).T).clamp_min(0)
     return cosine @ (panorama * solid_angles[..., None]).reshape(-1, 3)
@@ -48,7 +48,7 @@ def test_a_sun_in_the_panorama_becomes_a_source_however_bright_the_sky_is(sky, s
     wanted = lit_by(panorama, normals).mean(1)
     found = light.irradiance(normals).mean(1)
     # degree 2 leaves out up to 3% of an even hemisphere's irradiance (Ramamoorthi and Hanrahan 2001), on dark sides
-    # of more; the disc's extent, which the cosine to its middle leaves out, is worth less
+    # more; the disc's extent, which the cosine to its middle omits, matters less
     assert float((found / wanted).log2().abs().median()) < 0.05
     assert float(((found - wanted) / wanted.max()).abs().max()) < 0.05
 

@@ -25,7 +25,7 @@ def shipped_samples(count, side=32):
 
 
 def relit_folder(folder: Path, count=3, side=32) -> Path:
-    """The layout of generated pairs."""
+    """Write the layout of generated pairs."""
     for name, sample in shipped_samples(count, side):
         folder.mkdir(parents=True, exist_ok=True)
         write_sample(folder / name, sample, {"group": name, "licence": "shipped photograph"})
@@ -34,7 +34,7 @@ def relit_folder(folder: Path, count=3, side=32) -> Path:
 
 
 def rendered_folder(folder: Path, count=2, side=32) -> Path:
-    """The layout of `splatgraft synth pairs`, one camera a scene."""
+    """Write the layout of `splatgraft paper synth pairs`, one camera a scene."""
     lines = []
     for name, sample in shipped_samples(count, side):
         scene = folder / f"scene_{name}"

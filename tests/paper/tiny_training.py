@@ -32,7 +32,7 @@ def silent(*words):
 
 @dataclass(frozen=True)
 class Run:
-    """A training that `train` takes."""
+    """Training as `train` takes it."""
 
     task: ObjectiveTask
     cache: LatentCache
@@ -70,7 +70,7 @@ def training(tmp_path, name, loop=QUICK, *, pairs=2, progress=silent, say=silent
 
 
 def measured_by(run):
-    """The weights that the network has at each validation: a dictionary that is filled while training."""
+    """Record the network's weights at each validation in a dictionary, which is filled while training."""
     measured, plain = {}, run.task.validate
 
     def validate(network):

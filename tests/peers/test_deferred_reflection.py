@@ -1,4 +1,4 @@
-"""3DGS-DR against a mirror ball that is known in closed form: its environment, and its look under another one."""
+"""3DGS-DR on a mirror ball in closed form: its environment, and its picture under another one."""
 
 import pytest
 import torch
@@ -22,7 +22,7 @@ RADIUS = 0.5
 
 
 def sky(directions):
-    """An environment with more detail than the colours of a Gaussian can follow, sRGB."""
+    """Return an environment with more detail than the colours of a Gaussian can follow, sRGB."""
     x, y, z = directions.unbind(-1)
     return 0.5 + 0.4 * torch.stack([(3 * z).sin(), (3 * x + z).cos(), (3 * y).sin()], -1)
 
@@ -32,7 +32,7 @@ def other_sky(directions):
 
 
 def mirror(camera, environment):
-    """The picture of a mirror ball at the origin before black, and where it is; rays meet it in closed form."""
+    """Return the picture of a mirror ball at the origin before black, and its mask; rays meet it in closed form."""
     rays, eye = pixel_rays(camera), camera.centers[0]
     along = -(rays @ eye)
     square = along**2 - (eye @ eye - RADIUS**2)
@@ -90,7 +90,7 @@ def test_a_mirror_is_found_and_held_out_views_show_it(fitted):
     drawn = render(scene.gaussians, camera, features=scene.strength[:, None])
     # it starts at a thousandth
     assert float(drawn.features[0, ..., 0][inside].median()) > 0.5
-    # an even ball of the mean colour, as a scene without reflections begins
+    # an even ball of the mean colour, like the start of a scene without reflections
     flat = torch.full_like(truth, float(truth[hit].mean()))
     assert float(psnr(scene.picture(camera).detach(), truth, inside)) > float(psnr(flat, truth, inside)) + 8
 

@@ -107,7 +107,7 @@ def test_an_editing_service_is_sent_the_paper_s_prompt_composite_and_mask(servic
     said, options = [], ImageEditingOptions(weights=service, max_cost=0.2)
     monkeypatch.setenv(KEY_VARIABLE, "secret")
     image = make_harmonizer(options, HarmonizerContext(views=3, say=said.append)).harmonize(view()).image
-    assert (image - view().composite).abs().max() < 1 / 255  # the stand-in sends the composite back, in 8 bits
+    assert (image - view().composite).abs().max() < 1 / 255  # the stand-in returns the composite, in 8 bits
     key, body = Service.asked[0]
     text, _, mask = body["contents"][0]["parts"]
     assert key == "secret"
@@ -132,7 +132,7 @@ def test_an_editing_service_that_fails_or_has_no_key_is_one_line(service, monkey
 
 @pytest.fixture
 def other_python(tmp_path):
-    """An interpreter that runs `program` instead of the adaptor's, as PYTHON - MODEL_FOLDER INPUT OUTPUT."""
+    """Return an interpreter that runs `program` instead of the adaptor's, as PYTHON - MODEL_FOLDER INPUT OUTPUT."""
     python, file = tmp_path / "python", tmp_path / "program.py"
 
     def make(program):
@@ -169,12 +169,12 @@ def test_mv_colight_sees_squares_whose_shorter_side_has_its_size_and_nothing_is_
         flat = disc[..., None].expand(-1, -1, 3)
         return HarmonizerInputs(flat, flat, disc, 1 + disc, torch.zeros(h, w, 3), flat)
 
-    # as rescale_and_crop of its data sets: the shorter side to 256, the aspect kept
+    # like rescale_and_crop of its data sets: the shorter side to 256, the aspect kept
     for h, w, count in ((496, 704, 2), (256, 256, 1), (300, 1000, 4), (704, 496, 2)):
         squares = network_input(shown(h, w))
         assert squares.shape == (count, 7, 256, 256)
     disc = network_input(shown(496, 704))[0, 0] > 0.5
     rows, columns = disc.any(1).sum(), disc.any(0).sum()
-    # the disc of a quarter of the height is as wide as it is high, if all of it is in the first square
+    # a disc of a quarter of the height is as wide as high, if all of it is in the first square
     assert abs(int(rows) - 128) <= 2
     assert abs(int(columns) - 128) <= 2

@@ -1,4 +1,4 @@
-"""placement.json: exact round trip, the forms that are read, and one clear line for everything else."""
+"""placement.json: exact round trip, the accepted forms, and one clear line for everything else."""
 
 import contextlib
 import json

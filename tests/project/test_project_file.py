@@ -20,7 +20,7 @@ def template() -> str:
 
 
 def with_one_key(lines: list[str], at: int, mark: str) -> str:
-    """The text with line `at` uncommented, and the header of its table where that is commented."""
+    """Return the text with line `at` uncommented, and the header of its table if that is commented."""
     chosen = list(lines)
     header = max(i for i in range(at) if re.match(r"(# )?\[[\w.]+\]\s*(#.*)?$", lines[i]))
     for i in (header, at):
@@ -29,7 +29,7 @@ def with_one_key(lines: list[str], at: int, mark: str) -> str:
 
 
 def with_all_defaults(text: str) -> str:
-    """The full file with every key uncommented that has a default, but for those of a method."""
+    """Return the full file with every key uncommented that has a default, except those of a method."""
     defaults = {(table.name, key.name) for table in project_keys() for key in table.keys if key.default == key.example}
     lines, table = [], ""
     for line in text.splitlines():
@@ -106,7 +106,7 @@ def test_a_renamed_key_is_understood_with_a_line_that_says_the_new_name(
     compose = read_flow(path).steps["compose"]
     assert isinstance(compose, Compose)
     assert compose.options.point == (1.0, 2.0, 3.0)
-    assert main(["run", str(path)]) == 2  # there is no capture a
+    assert main(["run", str(path)]) == 2  # capture a does not exist
     assert "project.toml [compose]: at is now called point" in capsys.readouterr().err.splitlines()[0]
     path.write_text(f"{text}[compose]\nat = [1, 2, 3]\npoint = [1, 2, 3]\n")
     with pytest.raises(ValueError, match=r"\[compose\]: expected point alone, found also at"):

@@ -50,7 +50,7 @@ def test_the_pixels_of_a_stride_are_those_of_the_whole_picture(pyramid):
         ]
         assert len(place) == 1
         top, left = place[0]
-        # a splat ends at the pixels where its alpha is below 1/255, which rounding moves; there are 80 of them
+        # a splat ends at the pixels with an alpha below 1/255, which rounding moves; there are 80 of them
         assert (part - full[top::2, left::2]).abs().max() < 0.02
         assert (part - full[top::2, left::2]).abs().mean() < 1e-4
         seen[top::2, left::2] += 1

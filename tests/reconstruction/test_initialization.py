@@ -1,4 +1,4 @@
-"""Initial Gaussians: from sparse points, at random in the volume that cameras see, and a shell behind the scene."""
+"""Initial Gaussians: from sparse points, at random in the cameras' common volume, and a shell behind the scene."""
 
 import torch
 
@@ -95,7 +95,7 @@ def test_extent_is_that_of_3dgs():
 
 
 def outward(count: int = 8):
-    """Cameras near `FOCUS` that look outwards all around; pictures red above the horizon and blue below."""
+    """Return cameras near `FOCUS` that look outwards all around; pictures red above the horizon and blue below."""
     angle = torch.arange(count) * (2 * torch.pi / count)
     direction = torch.stack([angle.cos(), angle.sin(), torch.zeros(count)], 1)
     poses = look_at(FOCUS.float() + 0.1 * direction, FOCUS.float(), torch.tensor([0.0, 0, 1]))
@@ -112,7 +112,7 @@ def test_points_lie_evenly_on_the_sphere_where_cameras_look_in_the_colours_seen_
     offset = shell.points.double() - FOCUS
     # float32 rounding of numbers around 50
     assert torch.allclose(offset.norm(dim=1), torch.tensor(50.0, dtype=torch.float64), atol=1e-4)
-    # about as many as asked for: the border of the seen part cuts through the lattice
+    # about the given number: the border of the seen part cuts through the lattice
     assert 450 <= len(shell) <= 550
     elevation = (offset[:, 2] / 50).asin()
     # half the field of view is atan(15 / 20), 37 degrees in the middle of a picture

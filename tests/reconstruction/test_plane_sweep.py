@@ -9,13 +9,13 @@ DISTANCE = 4.0
 
 
 def texture(points: torch.Tensor) -> torch.Tensor:
-    """Smooth colours that differ everywhere within some units of the origin."""
+    """Return smooth colours that differ everywhere within some units of the origin."""
     waves = torch.tensor([[2.1, 0.7], [-1.3, 1.9], [0.9, -2.3]])
     return 0.5 + 0.25 * (points @ waves.T).sin() + 0.2 * (1.7 * points @ waves.flip(0).T).cos()
 
 
 def views_of_a_floor() -> tuple[list, list]:
-    """Ten views from a circle down to the plane z = 0, and their pictures by the ray through each pixel."""
+    """Return ten views from a circle down to the plane z = 0, and their pictures by the ray through each pixel."""
     angle = torch.arange(10) * (2 * torch.pi / 10)
     eye = torch.stack([1.5 * angle.cos(), 1.5 * angle.sin(), torch.full_like(angle, DISTANCE)], 1)
     poses = camera_values.look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.1]))
@@ -36,7 +36,7 @@ def test_points_lie_on_the_surface_that_the_views_show():
     found = sweep(cameras, images, known=torch.zeros(0, 3), reach=DISTANCE)
     assert len(found) > 500
     # 32 depths evenly spaced in inverse depth from 8 to 0.4 times the distance: the step at the floor is
-    # d^2 (1 / 0.4 - 1 / 8) / (31 d) = 0.077 d = 0.31, and the nearest hypothesis half of it off; of ties the farther
+    # d^2 (1 / 0.4 - 1 / 8) / (31 d) = 0.077 d = 0.31, and the nearest hypothesis is half of it off; of ties the farther
     # one is taken, which may be another step
     assert found.points[:, 2].abs().median() < 0.5
     truth = texture(found.points[:, :2])
@@ -58,7 +58,7 @@ def test_no_point_is_put_in_front_of_a_camera():
     centers = torch.cat([camera.centers for camera in cameras])
     if len(found):
         assert torch.cdist(found.points, centers).min() > NEAR * DISTANCE
-        # nothing tells the depths of a blank wall apart: the farthest in view is taken
+        # all depths of a blank wall match equally: the farthest in view is taken
         assert (found.points - centers.mean(0)).norm(dim=1).median() > 2 * DISTANCE
 
 

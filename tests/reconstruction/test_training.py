@@ -29,7 +29,7 @@ SURROUNDINGS = "splatgraft.reconstruction.training.shows_surroundings"
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory) -> PosedImages:
-    """Sixteen 48x40 views of 150 blobs, with noisy points for them."""
+    """Return sixteen 48x40 views of 150 blobs, with noisy points for them."""
     folder: Path = tmp_path_factory.mktemp("capture")
     truth = random_scene(150, 0, seed=0)
     truth = replace(truth, means=0.6 * truth.means, log_scales=truth.log_scales / 3 - 1, sh=2.5 * truth.sh)
@@ -58,7 +58,7 @@ def test_held_out_views_are_found_again(capture):
     assert scene.count <= 300
     assert scene.sh_degree == 1
     # black images score about 12 dB here; views between known ones of a scene that Gaussians can express exactly
-    # must come far above it, though 48x40 pixels leave the geometry between views open
+    # must come far above it, although 48x40 pixels leave the geometry between views open
     assert held_out_psnr(scene, capture) > 20
 
 
@@ -92,7 +92,7 @@ def test_held_out_views_change_nothing(capture, tmp_path):
 
 
 def watched_counts(capture: PosedImages, budget: int) -> list[float]:
-    """Numbers of Gaussians that the progress of a short reconstruction tells, in hundreds."""
+    """Return the numbers of Gaussians in the progress of a short reconstruction, in hundreds."""
     counts = []
 
     def watch(done: int, total: int, message: str) -> None:
@@ -114,7 +114,7 @@ def test_the_budget_holds_at_every_moment_and_many_points_leave_room_for_the_den
 
 @pytest.fixture
 def before_walls(capture, tmp_path) -> PosedImages:
-    """The blobs inside a large sphere that is dark on one side and bright on the other; no points on it."""
+    """Return the blobs inside a large sphere that is dark on one side and bright on the other; no points on it."""
     truth = reconstruct(capture, ReconstructOptions(iterations=1, budget=150, sh_degree=0, quality="draft"))
     direction = torch.nn.functional.normalize(torch.randn(3000, 3, generator=torch.Generator().manual_seed(3)), dim=1)
     shade = (0.05 + 0.6 * (direction[:, :1] > 0)).expand(-1, 3)
@@ -145,7 +145,7 @@ def test_without_points_it_says_so_and_goes_on(capture):
     options = ReconstructOptions(iterations=120, budget=300, sh_degree=0, eval_every=8)
     scene = reconstruct(bare, options, progress=lambda done, total, message: said.append(message))
     assert any("no sparse points" in message for message in said)
-    # better than the black image (about 12 dB), from nothing but pictures
+    # better than the black image (about 12 dB), from pictures alone
     assert held_out_psnr(scene, capture) > 15
 
 

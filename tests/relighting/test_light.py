@@ -1,4 +1,4 @@
-"""The light at a place: its panorama, the evidence of shading and highlights, the estimate in scenes of known light."""
+"""The light at a place: its panorama, evidence of shading and highlights, estimates in scenes of known light."""
 
 import math
 from dataclasses import replace
@@ -100,7 +100,7 @@ def test_near_things_are_left_out():
 
 
 def test_wide_gaussians_close_by_are_not_smeared_over_the_horizon():
-    # a sky, and under the point a table of discs as wide as they are far
+    # a sky, and under the point a table of discs as wide as their distance
     sky = shell(torch.full((3000, 3), 0.7), even_directions(3000), radius=6.0, spread=0.36)
     x = torch.linspace(-0.6, 0.6, 5)
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
@@ -127,12 +127,12 @@ def high_views():
 
 
 def polished(looks, sun):
-    """A lobe of cos^16 around the mirrored sun, for unit directions from a camera down to the plane."""
+    """Return a lobe of cos^16 around the mirrored sun, for unit directions from a camera down to the plane."""
     return ((looks * torch.tensor([1.0, 1.0, -1.0])) @ sun).clamp_min(0) ** 16
 
 
 def rough(looks, sun):
-    """Light that a rough dielectric reflects: GGX of alpha .5 with Smith's masking of both sides and Fresnel."""
+    """Return the reflection of a rough dielectric: GGX of alpha .5 with Smith's masking of both sides and Fresnel."""
     alpha, view = 0.5, -looks
     half = torch.nn.functional.normalize(view + sun, dim=1)
     spread = alpha**2 / (math.pi * (half[:, 2] ** 2 * (alpha**2 - 1) + 1) ** 2)
@@ -222,7 +222,7 @@ COUNT = len(DIRECTIONS)
 
 
 def receivers(points: torch.Tensor, visibility: torch.Tensor | None = None) -> ShadingEvidence:
-    """Gray, level surfaces."""
+    """Return gray, level surfaces."""
     n = len(points)
     return ShadingEvidence(
         region=BoundingSphere(torch.zeros(3), 1.0),
@@ -319,7 +319,7 @@ def degrees_apart(one, other):
 
 
 def painted(scene, gray):
-    """The floor of a scene times a gray of its x and y."""
+    """Return the floor of a scene times a gray of its x and y."""
     on_floor = scene.means[:, 2] < 0.02
     color = linear_from_srgb(rgb_from_dc(scene.sh[:, 0])) * torch.where(on_floor, gray(scene.means), 1)[:, None]
     return replace(scene, sh=dc_from_rgb(srgb_from_linear(color))[:, None])
@@ -348,7 +348,7 @@ def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s
         set_sun(points[::-1], CapturedScene(scene, views()))
     with pytest.raises(ValueError, match="expected pairs"):
         set_sun(points[:3], CapturedScene(scene, views()))
-    # far from all surfaces there is no edge: only the direction is taken from the points
+    # far from all surfaces there is no edge: the points give only the direction
     away = [(20.0 + x, y, z) for x, y, z in points]
     assert set_sun(away, CapturedScene(scene, views())).ratio is None
 
@@ -382,7 +382,7 @@ def test_an_even_sky_gives_an_even_light():
 
 
 def windowed_room(window, radius_deg, white=1.0):
-    """A shell of radius 20 with a bright disc towards `window`, and a floor that it lights."""
+    """Return a shell of radius 20 with a bright disc towards `window`, and a floor that it lights."""
     shell = even_directions(6000)
     bright = shell @ window > math.cos(math.radians(radius_deg))
     rgb = torch.where(bright[:, None], white, 0.4).repeat(1, 3)
@@ -398,7 +398,7 @@ def test_a_clipped_window_is_a_source_where_it_was_photographed(radius_deg, whit
     # brighter than the camera recorded: white over its solid angle is 0.095
     assert main.luminance > 0.2
     assert main.name == "window"  # a room's wall is behind it
-    if radius_deg == 14:  # wide enough that it is no sun behind a window
+    if radius_deg == 14:  # too wide to be a sun behind a window
         assert main.distance == pytest.approx(20, rel=0.05)
 
 
@@ -437,7 +437,7 @@ def test_a_white_floor_is_no_source(strength):
     found = estimate_light(CapturedScene(bright, views((0.0, 1.5))), place)
     assert isinstance(found, EstimatedLight)
     assert all(source.direction[2] > 0 for source in found.mean.sources)
-    # its light still arrives: more on what faces it than on what faces away
+    # its light still arrives: more on surfaces that face it than on those that face away
     towards, away = found.mean.irradiance(torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])).mean(1)
     assert float(towards) > 1.5 * float(away)
 
@@ -470,7 +470,7 @@ def test_a_harmonic_fit_of_half_the_sphere_recovers_an_even_light():
     ambient = fit_ambient(torch.tensor([0.2, 0.3, 0.4]))
     values = torch.tensor([0.2, 0.3, 0.4]).repeat(2000, 1)
     half = (around[:, 2] < 0).float()
-    # the ridge takes a few parts in 1e3 where half is unseen
+    # the ridge takes a few parts in 1e3 if half is unseen
     assert torch.allclose(fit_sh(around, values, half), ambient, atol=5e-3)
 
 
@@ -478,7 +478,7 @@ PLACE = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3)
 
 
 def room() -> Gaussians:
-    """A floor in a gray shell."""
+    """Return a floor in a gray shell."""
     generator = torch.Generator().manual_seed(0)
     floor = torch.cat([(torch.rand(4000, 2, generator=generator) - 0.5) * 5, torch.zeros(4000, 1)], 1)
     shell = even_directions(4000)

@@ -178,7 +178,7 @@ def at_ball(light: Light) -> ReflectedLight:
 
 
 def glossy_ball(light: Light, reflectance, *, concentration=6.0, dielectric=False) -> Gaussians:
-    """A ball with a lobe as bands of degree 3; directions behind the surface show what those in front do."""
+    """Return a ball with a lobe as bands of degree 3; directions behind the surface show the same as those in front."""
     views = even_directions(400)
     cosine = (views @ AROUND.T).T.abs()
     in_front = views - ((views @ AROUND.T).T + cosine)[..., None] * AROUND[:, None]
@@ -202,7 +202,7 @@ def materials_of(body: Gaussians, light: Light):
 def test_a_lobe_is_found_again(concentration):
     light = lamp(1, 0, 1)
     found = materials_of(glossy_ball(light, (0.3, 0.2, 0.1), concentration=concentration), light)
-    # bands of degree 3 hold most of such lobes; belief, pixels and blur each take some of it
+    # bands of degree 3 hold most of such lobes; belief, pixels and blur each reduce them a little
     assert torch.allclose(found.reflectance.median(0).values, torch.tensor([0.3, 0.2, 0.1]), rtol=0.35)
     assert float(found.concentration.median()) in (concentration / 2, concentration, 2 * concentration)
     assert not found.dielectric.float().mean() > 0.5

@@ -36,7 +36,7 @@ RADIUS = 0.3
 
 
 def floor(half=1.5, count=150, height=0.0) -> Gaussians:
-    """A floor at z = 0 whose Gaussians lie off it by `height`, a standard deviation."""
+    """Return a floor at z = 0 with Gaussians off it by `height`, a standard deviation."""
     x = torch.linspace(-half, half, count)
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
     z = height * torch.randn(len(grid), 1, generator=torch.Generator().manual_seed(0))
@@ -67,7 +67,7 @@ def relit_ball(light, *, target=None, gray=0.0, options=WHOLE, views=None):
 
 
 def ground_points(camera):
-    """Where the rays of the pixels meet z = 0, and the rays."""
+    """Return the intersections of the pixels' rays with z = 0, and the rays."""
     v, u = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     pose, k = camera.world_from_camera[0], camera.intrinsics[0]
     rays = torch.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], torch.ones_like(u)], -1) @ pose[:3, :3].T
@@ -75,7 +75,7 @@ def ground_points(camera):
 
 
 def lost_light(relit):
-    """Share of light that the target loses, and where."""
+    """Return the share of light that the target loses, and the positions."""
     scene = ~relit.is_object
     return 1 - relit.shadow[scene].mean(1), relit.gaussians.means[scene]
 
@@ -84,7 +84,7 @@ def lost_light(relit):
 def test_the_shadow_of_a_ball_is_as_wide_as_rays_from_the_lamp_make_it(distance):
     lost, points = lost_light(relit_ball(from_above(angular_radius_deg=0.5, distance=distance)))
     radius = (float((lost > 0.5).sum()) * (3.0 / 149) ** 2 / math.pi) ** 0.5
-    # the cone of rays that touch the ball, where it meets the floor
+    # the cone of rays that touch the ball, at the floor
     sine = RADIUS / distance
     truth = RADIUS if math.isinf(distance) else (distance + 0.5) * sine / math.sqrt(1 - sine**2)
     # a quarter of the 0.02 between receivers, and 0.5% for splats that stand out of the ball by half of their width
@@ -120,10 +120,10 @@ def test_low_light_leaves_no_acne_on_a_rough_layer():
 
 
 def test_the_bounce_is_no_brighter_than_the_new_light_allows():
-    # an object that was overexposed where it comes from
+    # an object that was overexposed in its capture
     dim = from_above(irradiance=0.05, ambient=fit_ambient(torch.full((3,), 0.02)))
     relit = relit_ball(dim, gray=1.0)
-    # its lower half gets 0.02 pi of light and reflects 0.8 of it into less than half of what the floor sees
+    # its lower half gets 0.02 pi of light and reflects 0.8 of it into less than half of the floor's hemisphere
     assert 0.0 < float(relit.bounce.max()) < 0.8
 
 
@@ -135,7 +135,7 @@ def test_shadows_fitted_to_views_stand_where_the_surface_is_seen():
     for views in (0, 8):
         options = RelightOptions(fitted_views=views)
         relit = relit_ball(light, target=layer, options=options, views=low)
-        camera = low[[5]]  # not among the 8 that are fitted
+        camera = low[[5]]  # a view outside of the 8 fitted ones
         before, after = (
             linear_from_srgb(render(g, camera).color[0].clamp(0, 1)).mean(-1)
             for g in (layer, relit.shaded().select(~relit.is_object))
@@ -146,7 +146,7 @@ def test_shadows_fitted_to_views_stand_where_the_surface_is_seen():
         truth = torch.where(((to_center**2).sum(-1) - along**2) < RADIUS**2, 0.04, 1.0)
         near = (points[..., :2].norm(dim=-1) < 1.2) & (rays[..., 2] < 0)
         errors.append(float(((after / before.clamp_min(1e-3) - truth)[near] ** 2).mean().sqrt()))
-    # what the layer hides and blurs is not all undone: a quarter of the error at least is
+    # the fit does not undo all that the layer hides and blurs: it removes at least a quarter of the error
     assert errors[1] < 0.75 * errors[0]
 
 
@@ -154,7 +154,7 @@ def test_a_shadow_shades_what_is_seen_through_a_translucent_floor_too():
     x = torch.linspace(-12, 12, 25)
     at = torch.cat([torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2), torch.full((625, 1), -6.0)], 1)
     below = surfels(at, torch.tensor([[0.0, 0.0, 1.0]]).repeat(625, 1), width=1.0)
-    # at most half of a pixel is of the floor
+    # the floor is at most half of a pixel
     thin = replace(floor(), opacity_logits=torch.full((22_500,), -3.0))
     target = concatenate([thin, below])
     light = from_above(x=1.0)
@@ -193,7 +193,7 @@ def test_the_shadow_is_darkest_at_the_foot():
 
 
 def test_an_even_sky_leaves_no_light_where_a_ball_touches_the_floor():
-    """Closed form: a sphere on a plane takes R^3 / d^3 of the irradiance, d from its centre to the point."""
+    """Return the closed form: a sphere on a plane takes R^3 / d^3 of the irradiance, d from its centre to the point."""
     light = Light(sources=(), ambient=fit_ambient(torch.full((3,), 1.0)))
     samples = sample_light(light)
     maps = object_shadow_maps(ball(), bounding_sphere(ball()), samples)
@@ -206,7 +206,7 @@ def test_an_even_sky_leaves_no_light_where_a_ball_touches_the_floor():
     ratio = scene_ratio(maps, points, up, sample_visibility=torch.ones(len(points), len(samples)))
     found = ratio.shadow.mean(1).reshape(len(away), -1).mean(1)
     truth = 1 - (1 + (away / RADIUS) ** 2) ** -1.5
-    # 32 directions stand for the whole sky, so a cone of 0.35 rad leaves a part of its rim; and `darkest` is left
+    # 32 directions stand for the whole sky, so a cone of 0.35 rad covers a part of its rim only; and `darkest` remains
     torch.testing.assert_close(found, truth, rtol=0, atol=0.05)
 
 
@@ -240,10 +240,10 @@ def sun(radius_deg) -> LightSource:
 
 
 def error(width, options) -> float:
-    """RMSE of the ratio of light after to before, over the shadow beside the ball."""
+    """Return the RMSE of the ratio of light after to before, over the shadow beside the ball."""
     center = torch.tensor([0.0, 0.0, RADIUS])
     plane, dark = edge_plane(width), dark_ball(center)
-    # hardly any sky: its part of the ratio is left out of the truth
+    # hardly any sky: its part of the ratio is not in the truth
     light = Light((sun(0.25),), fit_ambient(torch.full((3,), 1e-3)))
     composite = Composite(plane, (PlacedObject(dark, IDENTITY),), torch.zeros(plane.count, dtype=torch.bool))
     relit = relight(composite, edge_cameras(), light=light, options=options)
@@ -260,7 +260,7 @@ def error(width, options) -> float:
 @pytest.mark.parametrize(
     ("width", "most", "share"),
     # measured 0.249 and 0.145 (0.536 and 0.195 unsplit), an eighth more is allowed; an edge that lies one pixel off,
-    # as splats' order makes it, costs 0.13 in a picture of this size
+    # caused by the order of splats, costs 0.13 in a picture of this size
     [(0.15, 0.28, 0.6), (0.03, 0.165, 0.85)],
 )
 def test_wide_gaussians_hold_a_hard_shadow_once_they_are_split(width, most, share):
@@ -270,7 +270,7 @@ def test_wide_gaussians_hold_a_hard_shadow_once_they_are_split(width, most, shar
 
 
 def seen_from(view, relit, plane, ground) -> torch.Tensor:
-    """Light left at points of the ground, as a picture shows it."""
+    """Return the light left at points of the ground, as in a picture."""
     camera = edge_cameras()[view]
     before, after = render(plane, camera), render(relit, camera)
     ratio = linear_from_srgb(after.color[0]).mean(-1) / linear_from_srgb(before.color[0]).mean(-1).clamp_min(1e-3)
@@ -283,7 +283,7 @@ def seen_from(view, relit, plane, ground) -> torch.Tensor:
 
 
 def test_an_edge_stands_in_one_place_from_all_sides():
-    # high enough that no view of its shadow is hidden; its own Gaussians are left out of the pictures
+    # so high that no view of its shadow is hidden; its own Gaussians are not in the pictures
     plane, dark = edge_plane(0.03), dark_ball(torch.tensor([0.0, 0.0, 2 * RADIUS]))
     composite = Composite(plane, (PlacedObject(dark, IDENTITY),), torch.zeros(plane.count, dtype=torch.bool))
     light = Light((sun(5.0),), fit_ambient(torch.full((3,), 0.25)))
@@ -305,7 +305,7 @@ def test_an_edge_stands_in_one_place_from_all_sides():
 
 
 def test_a_slope_too_small_to_square_changes_nothing():
-    """Squares below 1e-38 are 0 in float32: a length of 0 under a slope that is not."""
+    """Squares below 1e-38 are 0 in float32, so a length may be 0 although its slope is not."""
     points, up = torch.rand(20, 3), torch.tensor([[0.0, 0.0, 1.0]]).repeat(20, 1)
     scene = surfels(points, up, width=0.1, thickness=0.01, srgb=0.5)
     relit = pasted(Composite(scene, (), torch.zeros(20, dtype=torch.bool)), "")

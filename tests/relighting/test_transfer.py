@@ -1,4 +1,4 @@
-"""Properties of the whole transfer on a floor with balls, where the answer is known by symmetry or in closed form."""
+"""Properties of the whole transfer on a floor with balls, known by symmetry or in closed form."""
 
 import math
 from dataclasses import replace
@@ -39,7 +39,7 @@ from splatgraft.relighting.shading import ShadeSettings, shade_ratio
 SKY = fit_ambient(torch.tensor([0.4, 0.5, 0.6]))
 QUARTER = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 WHOLE = RelightOptions(most_added=0.0, fitted_views=0)
-"""Nothing is split: Gaussians can be compared one by one."""
+"""Options without splitting, so that Gaussians can be compared one by one."""
 
 
 def floor(half=2.0, count=90) -> Gaussians:
@@ -85,12 +85,12 @@ STANDARD = placed((ball(), at(0.0, 0.0, 0.35)))
 
 @cache
 def standard(x, y) -> Relit:
-    """A gray ball over a floor in sunlight at 45 degrees from a side."""
+    """Return a gray ball over a floor in sunlight at 45 degrees from a side."""
     return relight(STANDARD, cameras(), light=sun_from(x, y, 1), options=WHOLE)
 
 
 def darkness(relit):
-    """Linear light lost on the target, and where."""
+    """Return the linear light lost on the target, and the positions."""
     scene = ~relit.is_object
     return (1 - relit.ratio()[scene]).mean(1), relit.gaussians.means[scene]
 
@@ -217,7 +217,7 @@ def test_tint_and_exposure_change_the_object_alone():
     brighter = relit.ratio(LayerWeights(exposure=1.0))
     assert torch.equal(brighter[objects], 2 * usual[objects])
     assert torch.equal(brighter[~objects], usual[~objects])
-    # the transfer has not been done again: the layers are the same, only their weights are not
+    # the transfer is not computed again: the layers are equal, only their weights differ
     assert torch.equal(relit.shaded(LayerWeights(tint=1.0, exposure=0.0)).sh, relit.shaded().sh)
 
 
@@ -225,7 +225,7 @@ def test_splitting_keeps_the_count_bounded_and_every_gaussian():
     composite = placed((ball(), at(0.0, 0.0, 0.35)), target=floor(count=30))
     relit = relight(composite, cameras(), light=sun_from(-1, 0, 1), options=replace(WHOLE, most_added=0.5))
     merged, _ = composite.merged()
-    # as many as any scene may have, though half of this one is fewer
+    # half of the limit of any scene, although half of this scene is fewer
     assert 0 < relit.gaussians.count - merged.count <= 40_000
     assert torch.equal(relit.origin.unique(), torch.arange(merged.count))
 
@@ -260,7 +260,7 @@ def test_values_that_moved_with_the_object_give_what_new_ones_do():
 
 
 def test_even_lights_change_a_share_of_the_tint_and_of_the_level():
-    # the ball is as bright as one of the expected albedo, 0.3, in the dim light
+    # the ball is as bright as a ball of the expected albedo, 0.3, in the dim light
     composite = placed((ball(rgb=(0.35, 0.35, 0.35)), at(0.0, 0.0, 0.6)), target=shell((0.8, 0.7, 0.6)))
     source = SourceScene(shell((0.6, 0.6, 0.6)), cameras())
     relit = relight(composite, cameras(), sources=(source,), options=WHOLE)
@@ -300,7 +300,7 @@ def test_shade_takes_the_stated_shares_of_level_and_tint():
 
 def test_shading_is_full_where_no_surface_is_sure():
     body = ball()
-    cloud = replace(body, log_scales=torch.full((body.count, 3), -3.0))  # round Gaussians: no flatness tells a normal
+    cloud = replace(body, log_scales=torch.full((body.count, 3), -3.0))  # round Gaussians: flatness shows no normal
     source, shades = SourceScene(empty(), cameras(), light=Light((), SKY)), []
     for one in (cloud, body):
         composite = placed((one, at(0, 0, 0.35)))
@@ -308,7 +308,7 @@ def test_shading_is_full_where_no_surface_is_sure():
         side = relit.gaussians.means[relit.is_object] @ torch.tensor([-0.7, 0.0, 0.7])
         shade = relit.shade[relit.is_object].log().mean(1)
         shades.append(float(torch.stack([side - side.mean(), shade - shade.mean()]).cov()[0, 1] / side.var()))
-    # both are the same ball: the slope of the shading towards the sun is the same but for the cloud's deeper rim
+    # both are the same ball: the slope of the shading towards the sun is equal except for the cloud's deeper rim
     assert shades[0] > 0.8 * shades[1]
 
 
@@ -320,7 +320,7 @@ def test_highlights_of_the_old_light_go_where_it_is_known():
     for source, kept in ((SourceScene(empty(), cameras(), light=even), False), (None, True)):
         relit = relight(composite, cameras(), sources=(source,), light=even, options=WHOLE)
         left = float(relit.shaded().sh[relit.is_object, 1:].abs().mean())
-        # noise resembles some lobe by chance: a tenth of it at most comes back as gloss
+        # noise resembles some lobe by chance: at most a tenth of it becomes gloss
         assert left > 0.05 if kept else left < 0.1 * float(bands.abs().mean())
         assert torch.equal(relit.shaded(LayerWeights(gloss=0.0, shade=0.0)).sh[relit.is_object], shiny.sh)
 
@@ -392,7 +392,7 @@ def test_light_json_round_trip_and_its_messages():
 
 
 GIVEN = Light(sources=(LightSource(direction=(0.6, 0.0, 0.8), irradiance=(3.0, 2.5, 2.0), name="sun"),), ambient=SKY)
-"""At an object's old place."""
+"""Light at an object's old place."""
 
 
 def test_what_is_given_of_an_objects_capture_is_turned_with_it_and_believed():
@@ -427,7 +427,7 @@ def test_between_two_given_lights_the_level_changes_in_full(factor):
 
 @pytest.fixture(scope="module")
 def dimmed() -> Relit:
-    """A ball from even light of radiance 0.4 in light of radiance 0.2, both in units of their captures' white."""
+    """Return the transfer of a ball from even light of radiance 0.4 into 0.2, both in units of their captures."""
     even = [Light(sources=(), ambient=fit_ambient(torch.full((3,), radiance))) for radiance in (0.4, 0.2)]
     composite = placed((ball(count=500), at(0.0, 0.0, 0.0)), target=shell(count=500))
     source = SourceScene(empty(), cameras(), light=even[0])

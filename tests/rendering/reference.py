@@ -1,4 +1,4 @@
-"""A renderer in plain torch operations, every pixel against every Gaussian: the reference for the fast ones.
+"""Reference renderer in plain torch operations: every pixel against every Gaussian.
 
 Written from the 3DGS paper's formulas, for small scenes, in the dtype of its input (float64 in the tests).
 """
@@ -18,7 +18,7 @@ MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
 def projection(
     gaussians: Gaussians, camera: Cameras, options: RenderOptions
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Centres in pixels, covariances in pixels^2 after the low-pass, opacities, depths."""
+    """Return centres in pixels, covariances in pixels^2 after the low-pass, opacities, depths."""
     pose, k = camera.camera_from_world[0].to(gaussians.means), camera.intrinsics[0].to(gaussians.means)
     x_in_camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
     depth = x_in_camera[:, 2]
@@ -33,7 +33,7 @@ def projection(
 
 
 def covariance_on_screen(gaussians: Gaussians, camera: Cameras) -> Float[Tensor, "n 3 3"]:
-    """Covariances of pixel x, pixel y and inverse depth, linearised at the centres."""
+    """Return covariances of pixel x, pixel y and inverse depth, linearised at the centres."""
     pose, k = camera.camera_from_world[0].to(gaussians.means), camera.intrinsics[0].to(gaussians.means)
     x_in_camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
     depth = x_in_camera[:, 2]
@@ -58,14 +58,14 @@ def covariance_on_screen(gaussians: Gaussians, camera: Cameras) -> Float[Tensor,
 def inverse_depths(
     gaussians: Gaussians, camera: Cameras, options: RenderOptions
 ) -> tuple[Float[Tensor, "h w n"], Float[Tensor, "n"]]:
-    """Mean of each Gaussian's inverse depth in each pixel, and its variance there."""
+    """Return the mean of each Gaussian's inverse depth in each pixel, and its variance there."""
     center, blurred, _, depth = projection(gaussians, camera, options)
     covariance = covariance_on_screen(gaussians, camera)
     slope = torch.einsum("nij,nj->ni", torch.linalg.inv(blurred), covariance[:, :2, 2])
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     away = torch.stack([x, y], -1)[:, :, None].to(center) - center
     mean, variance = 1 / depth + (away * slope).sum(-1), covariance[:, 2, 2] - (slope * covariance[:, :2, 2]).sum(1)
-    # no gradient where the centre is out of view: the plane is extrapolated there
+    # no gradient if the centre is out of view, because the plane is extrapolated there
     size = camera.sizes[0].to(center)
     shown = ((center > -0.15 * size) & (center < 1.15 * size)).all(1)
     return torch.where(shown, mean, mean.detach()), torch.where(shown, variance, variance.detach())
@@ -74,7 +74,7 @@ def inverse_depths(
 def weights(
     gaussians: Gaussians, camera: Cameras, options: RenderOptions
 ) -> tuple[Float[Tensor, "h w m"], Float[Tensor, "m"]]:
-    """Weight of every Gaussian in every pixel, nearest first, and the Gaussians' indices in that order."""
+    """Return the weight of every Gaussian in every pixel, nearest first, and the Gaussians' indices in that order."""
     center, covariance, opacity, depth = projection(gaussians, camera, options)
     order = torch.argsort(depth.detach(), stable=True)
     order = order[(depth >= options.near)[order]]
@@ -96,7 +96,7 @@ def render(
     features: Float[Tensor, "n f"],
     options: RenderOptions = RenderOptions(),
 ) -> Render:
-    """Every output for one camera; `visible` where a Gaussian has weight in a pixel."""
+    """Return every output for one camera; `visible` marks Gaussians with weight in a pixel."""
     weight, order = weights(gaussians, camera, options)
     inverse, variance = (x[..., order] for x in inverse_depths(gaussians, camera, options))
     offset = gaussians.means - camera.centers[0].to(gaussians.means)
@@ -129,7 +129,7 @@ def render(
 
 
 def undecided(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> Bool[Tensor, "h w"]:
-    """Pixels where rounding to float32 may decide otherwise: an alpha within 1e-4 of either of its bounds."""
+    """Return pixels that rounding to float32 may decide otherwise: an alpha within 1e-4 of either of its bounds."""
     center, covariance, opacity, _ = projection(gaussians, camera, options)
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     away = torch.stack([x, y], -1)[:, :, None].to(center) - center

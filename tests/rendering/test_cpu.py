@@ -45,7 +45,7 @@ def test_pictures_and_gradients_match_the_reference(degree, low_pass):
             assert (theirs > 0).any()
             assert not ours.requires_grad
             continue
-        # faint pixels magnify rounding in depth and normal, which are divided by how much there is
+        # faint pixels magnify rounding in depth and normal, which are divided by the coverage
         pixel_weights = torch.randn(ours[decided].shape, generator=generator)
         pixel_weights = torch.einsum("p...,p->p...", pixel_weights, expected.alpha[0][decided].detach().float())
         found_loss = found_loss + (pixel_weights * ours[decided]).sum()
@@ -54,7 +54,7 @@ def test_pictures_and_gradients_match_the_reference(degree, low_pass):
     expected_loss.backward()
     pairs = [(getattr(single, field.name), getattr(double, field.name)) for field in fields(Gaussians)]
     for ours, theirs in [*pairs, (single_features, double_features)]:
-        # the same arithmetic once more, with differences of like numbers: 5 digits of the largest
+        # the same arithmetic again, with differences of similar numbers: 5 digits of the largest
         assert (ours.grad - theirs.grad).abs().max() < 5e-5 * theirs.grad.abs().max()
     assert not (expected.visible & ~found.visible).any()
 
@@ -95,7 +95,7 @@ def test_moments_of_inverse_depth_and_their_gradients_match_the_reference(low_pa
         loss.backward()
     for field in fields(Gaussians):
         ours, theirs = getattr(single, field.name).grad, getattr(double, field.name).grad
-        # the same arithmetic once more, with differences of like numbers: 5 digits of the largest
+        # the same arithmetic again, with differences of similar numbers: 5 digits of the largest
         assert (ours - theirs).abs().max() < 5e-5 * theirs.abs().max()
 
 
@@ -123,7 +123,7 @@ def test_a_flat_gaussian_has_the_depth_of_its_plane():
     assert (drawn.depth[0] / expected - 1)[shown].abs().max() < 1e-3
     mean = drawn.inverse_depth[0, ..., 0] / drawn.alpha[0]
     assert (mean * expected - 1)[shown].abs().max() < 1e-3
-    # one plane: no spread but what the low pass leaves
+    # one plane: only the low pass leaves a spread
     spread = drawn.inverse_depth[0, ..., 1] - drawn.inverse_depth[0, ..., 0].square() / drawn.alpha[0]
     assert spread[shown].abs().max() < 1e-5
 
@@ -154,7 +154,7 @@ def test_inverse_depth_is_not_drawn_with_normals():
 
 
 def test_opaque_layers_hide_what_is_behind_them():
-    # 300 discs over the whole image: the early stop must come, and must not be seen
+    # 300 discs over the whole image: the early stop must happen, and must not be visible
     n = 300
     generator = torch.Generator().manual_seed(1)
     scene = Gaussians(
@@ -281,7 +281,7 @@ def test_degenerate_gaussians_do_no_harm(numbers, low_pass):
         opacity_logits=opacity[:, 0],
         sh=torch.nn.functional.pad(sh, (0, 1)).reshape(1, 4, 3),
     )
-    # colours that are not numbers are not for the renderer to mend
+    # the renderer does not repair colours that are not numbers
     bad = replace(bad, sh=bad.sh.nan_to_num(0, 0, 0).clamp(-10, 10))
     scene = concatenate([bad, good]).map(lambda t: t.requires_grad_())
     picture = rendering.render(scene, camera(), outputs=ALL, options=RenderOptions(low_pass=low_pass))

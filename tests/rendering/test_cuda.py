@@ -46,7 +46,7 @@ def test_pictures_and_gradients_match_the_cpu(low_pass):
 
 @pytest.mark.parametrize("low_pass_px2", [0.3, 0.075])
 def test_planes_of_inverse_depth_are_those_of_the_kernels(low_pass_px2):
-    # pure torch, so that it is tested without a GPU: blended by the CPU as features, against the CPU's own moments
+    # pure torch, so it is tested without a GPU: the CPU blends it as features; compared with the CPU's own moments
     options, view = RenderOptions(low_pass_px2=low_pass_px2), camera()
     scene, other = (random_scene(60, 0, seed=2).map(lambda t: t.requires_grad_()) for _ in range(2))
     ours = rendering.render(scene, view, outputs=frozenset({"inverse_depth"}), options=options).inverse_depth[0]
@@ -60,7 +60,7 @@ def test_planes_of_inverse_depth_are_those_of_the_kernels(low_pass_px2):
     (pixel_weights * theirs).sum().backward()
     for name in ("means", "log_scales", "quaternions", "opacity_logits"):
         found, expected = getattr(scene, name).grad, getattr(other, name).grad
-        # nine sums of like numbers instead of two, in float32
+        # nine sums of similar numbers instead of two, in float32
         assert (found - expected).abs().max() < 1e-3 * expected.abs().max(), name
 
 

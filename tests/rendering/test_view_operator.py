@@ -36,7 +36,7 @@ def test_blending_colours_is_rendering():
     # float32 colours of a few units, made by two routines
     assert (operator.blend(colors) - picture.color[0]).abs().max() < 1e-5
     assert (operator.alpha - picture.alpha[0]).abs().max() < 1e-6
-    # the renderer does not know what its early stop and the last pixel test leave out
+    # the renderer's `visible` includes Gaussians that the early stop and the last pixel test omit
     assert not (operator.visible & ~picture.visible[0]).any()
     assert torch.equal(operator.visible, (operator.blend_transpose(torch.ones(29, 37, 1)) > 0)[:, 0])
     assert isinstance(operator, ViewOperator)
@@ -75,7 +75,7 @@ def test_blending_and_transposing_at_once_equals_one_after_the_other(weighted):
 
 def test_rows_of_no_weight_are_left_out_of_the_map_and_of_its_transpose():
     scene = random_scene(4000, 0, seed=10)
-    scene = replace(scene, opacity_logits=scene.opacity_logits + 3)  # most lie behind others
+    scene = replace(scene, opacity_logits=scene.opacity_logits + 3)  # most are behind others
     exact = rendering.view_operator(scene, camera(100, 70))
     operator = rendering.view_operator(scene, camera(100, 70), min_row_weight=1e-4)
     generator = torch.Generator().manual_seed(11)

@@ -1,4 +1,4 @@
-"""Without a terminal every step has a line at its start, per tenth and at its end."""
+"""Progress without a terminal: every step has a line at its start, per tenth and at its end."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Files of the Hugging Face hub: what is asked for, the client's cache without a network, and errors in one line."""
+"""Files of the Hugging Face hub: the requested ones, the client's cache without a network, and errors in one line."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ STABLE_DIFFUSION = [
 
 @pytest.fixture
 def offline(tmp_path, monkeypatch) -> Path:
-    """The client's cache, with no network."""
+    """Return the client's cache, without a network."""
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     return tmp_path / "hub"
@@ -83,7 +83,7 @@ def test_what_is_in_the_cache_is_taken_without_a_network_and_what_is_not_is_one_
 
 def test_a_gated_repository_says_how_to_get_access(monkeypatch):
     def refused(*words, **named):
-        # its constructor takes the answer of an HTTP library that has changed between versions
+        # its constructor takes the answer of an HTTP library, which differs between versions
         raise GatedRepoError.__new__(GatedRepoError)
 
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", refused)

@@ -40,13 +40,13 @@ print(outer(1), sum(outer.stats.cache_hits.values()), plain_outer(1))
 
 @pytest.mark.parametrize("read_only", [False, pytest.param(True, marks=pytest.mark.long)])
 def test_an_edit_of_an_inlined_kernel_is_seen(tmp_path, read_only):
-    """By `kernel`, from where a package is installed; not by numba alone, for which it exists."""
+    """`kernel` sees the edit wherever the package is installed. numba alone does not, so `kernel` exists."""
     package = tmp_path / "tiny"
     (package / "runtime").mkdir(parents=True)
     (package / "runtime" / "kernels.py").write_text(Path(kernels.__file__).read_text())
     (package / "outer.py").write_text(OUTER)
     if read_only:
-        # a file where the folder of the cache would be, since the tests may run as root
+        # a file at the path of the cache's folder, because the tests may run as root
         (package / "__pycache__").touch()
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "home")}
     found = []

@@ -1,4 +1,4 @@
-"""Child processes leave nothing behind; a process ends with threads at work; a page opens where there is a desktop."""
+"""Child processes leave nothing behind; a process ends with threads at work; a page opens if there is a desktop."""
 
 import os
 import signal
@@ -34,7 +34,7 @@ def test_lines_of_the_output_are_handed_over_and_stay_out_of_the_log(tmp_path):
 
 
 def test_a_line_arrives_while_the_process_runs(tmp_path):
-    # the process ends only after the file exists that is made when its line arrives
+    # the process ends only after the file exists that its line causes
     program = "import os, sys, time; print(1, flush=True)\nwhile not os.path.exists('seen'): time.sleep(0.01)"
     seen = tmp_path / "seen"
     assert run_logged(python(program), tmp_path / "log", folder=tmp_path, on_line=lambda line: seen.touch()) == 0

@@ -1,4 +1,4 @@
-"""TOML tables become typed settings, or one line that says what is wrong where."""
+"""TOML tables become typed settings, or one line that names the error and its place."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

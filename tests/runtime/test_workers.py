@@ -1,4 +1,4 @@
-"""Parallel tasks: order of failures, a failure stops no other task, Ray with a worker that is killed."""
+"""Parallel tasks: order of failures, a failure stops no other task, Ray with a killed worker."""
 
 import os
 import signal
@@ -12,7 +12,7 @@ from splatgraft.runtime.workers import Task, run_tasks
 
 
 def write_once(out: Path) -> None:
-    """A job as they are here: it looks whether its file is there, and leaves it whole."""
+    """Check for its file first, and write it whole, like every job of the package."""
     if not out.exists():
         time.sleep(0.2)
         out.with_suffix(f".by{os.getpid()}").touch()
@@ -20,7 +20,7 @@ def write_once(out: Path) -> None:
 
 
 def write_after_dying_once(out: Path, deaths: Path) -> None:
-    """Kills its own process the first time, as a machine does that loses power."""
+    """Kill its own process the first time, like a machine that loses power."""
     if not deaths.exists():
         deaths.write_text(str(os.getpid()))
         os.kill(os.getpid(), signal.SIGKILL)

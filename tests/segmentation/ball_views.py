@@ -43,7 +43,7 @@ def wall():
 
 @pytest.fixture(scope="session")
 def scene(ball, wall):
-    """The first `BALL` Gaussians are the object."""
+    """Return the whole scene; its first `BALL` Gaussians are the object."""
     return concatenate([ball, wall])
 
 

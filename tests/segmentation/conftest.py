@@ -1,4 +1,4 @@
-"""The fixtures of this folder; what tests import by name lies in ball_views.py."""
+"""Fixtures of this folder; tests import helpers by name from ball_views.py."""
 
 from ball_views import ball, cameras, masks, photographs, scene, wall
 

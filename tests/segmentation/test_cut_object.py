@@ -1,4 +1,4 @@
-"""The object cut out of all pictures: where it is looked for, what the 3D selection, colour and clicks decide."""
+"""The object cut out of all pictures: its search region, and the effects of 3D selection, colour and clicks."""
 
 from dataclasses import replace
 
@@ -212,7 +212,7 @@ def test_what_is_in_the_box_but_apart_is_not_the_object():
         low, high = torch.tensor(lower), torch.tensor(upper)
         return low + (high - low) * torch.rand(count, 3, generator=generator)
 
-    # an L: its box has an empty corner, in which the end of something else lies
+    # an L: its box has an empty corner, which contains the end of another object
     post, foot = cube(600, (-0.3, -0.1, 0.0), (-0.1, 0.1, 0.6)), cube(600, (-0.3, -0.1, 0.0), (0.3, 0.1, 0.15))
     other = cube(100, (0.2, -0.1, 0.45), (0.3, 0.1, 0.6))
     floor = cube(3000, (-2.0, -2.0, -0.02), (2.0, 2.0, -0.019))

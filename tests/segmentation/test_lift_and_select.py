@@ -1,4 +1,4 @@
-"""Masks lifted to Gaussians, the selection by threshold, box and component, and both as `segment` joins them."""
+"""Masks lifted to Gaussians, the selection by threshold, box and component, and their combination in `segment`."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def test_closed_form_is_the_weighted_average_of_the_differentiable_render(scene,
     clear = seen > 0.01
     # the same sums in another order, float32, up to a few thousand pixels
     assert torch.allclose(feature[clear], (inside / seen)[clear], atol=1e-4)
-    # the ball's back is hidden by its front: seen by no camera, or only through gaps at the outline
+    # the ball's front hides its back from every camera, except through gaps at the outline
     assert float((feature[:BALL] >= 0.75).float().mean()) > 0.45
     assert float((feature[BALL:] >= 0.75).float().mean()) < 0.01
 
@@ -118,7 +118,7 @@ def test_segment_lifts_selects_and_solidifies_the_object_alone(scene, cameras, m
     assert torch.equal(plain.selection, select_object(scene, plain.feature))
     alone, fitted = (one.object.select(~one.is_guessed) for one in (plain, solid))
     assert torch.equal(alone.means, scene.means[plain.selection])
-    # the cameras stand in an arc before it
+    # the cameras are in an arc before it
     assert bool(plain.is_guessed.any())
     assert torch.equal(plain.surroundings.sh, scene.sh[~plain.selection])
     assert torch.equal(plain.selection, solid.selection)

@@ -47,7 +47,7 @@ def save(path, nodes, inputs, outputs, weights=()):
 
 @pytest.fixture
 def red(tmp_path):
-    """A network that answers with the normalised red channel, as logits or as it is."""
+    """Write a network that answers with the normalised red channel, as logits or unchanged."""
 
     def make(channels=3, side=32, head="Identity"):
         weight = constant("w", [1, channels, 1, 1], [1.0] + [0.0] * (channels - 1))
@@ -60,7 +60,7 @@ def red(tmp_path):
 
 @pytest.fixture
 def sam2(tmp_path):
-    """Networks whose three proposals are: the box, the rest of the picture, nothing; the first is the best."""
+    """Write networks with three proposals: the box, the rest of the picture, nothing; the first is the best."""
 
     def make(skip="", extra=()):
         pools = [

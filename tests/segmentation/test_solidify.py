@@ -14,7 +14,7 @@ from splatgraft.segmentation import SolidifyOptions, solidify_object
 
 @pytest.fixture(scope="module")
 def glassy(ball, wall):
-    """The ball at a tenth of its opacity, with a spill of wall colour that the masks do not cover."""
+    """Return the ball at a tenth of its opacity, with a spill of wall colour outside of the masks."""
     spill = splats(torch.tensor([[0.9, 0.0, 0.0]]), 0.1, 0.9, torch.tensor([[0.4, 0.4, 0.45]]))
     thin = replace(ball, opacity_logits=torch.full((BALL,), -2.0))
     return concatenate([thin, spill, wall])
@@ -85,7 +85,7 @@ def test_what_no_photograph_shows_gets_the_colour_of_what_is_beside_it(scene, ba
 
 
 def striped(scene, cameras):
-    """The scene photographed with dark and light stripes on the ball, 8 over its height."""
+    """Return the scene photographed with dark and light stripes on the ball, 8 over its height."""
     stripes = torch.where((scene.means[:, 2] * 20).sin() > 0, 0.2, 0.9)[:, None].expand(-1, 3)
     is_ball = torch.arange(scene.count) < BALL
     sh = torch.where(is_ball[:, None, None], dc_from_rgb(stripes)[:, None], scene.sh[:, :1])

@@ -1,4 +1,4 @@
-"""The side of an object that no photograph shows is closed: opaque, in the colours beside it, and nowhere else."""
+"""A side of an object without photographs is closed: opaque, in the colours beside it, and nowhere else."""
 
 import math
 
@@ -17,7 +17,7 @@ CENTER = torch.tensor([0.3, -0.2, 0.5])
 
 
 def egg(spot_deg: float) -> Gaussians:
-    """Lying on a floor at z = .2, painted from red to blue along its axis, with a green spot low down at an azimuth."""
+    """Return an egg on a floor at z = .2, painted from red to blue along its axis, with a green spot on one side."""
     around = even_directions(6000)
     radii = torch.tensor([0.5, 0.3, 0.3])
     normals = torch.nn.functional.normalize(around / radii, dim=1)
@@ -29,7 +29,7 @@ def egg(spot_deg: float) -> Gaussians:
 
 
 def ring(first_deg: float, last_deg: float, count: int = 10) -> Cameras:
-    """Two rings of cameras over a range of azimuths."""
+    """Return two rings of cameras over a range of azimuths."""
     turns = torch.deg2rad(torch.linspace(first_deg, last_deg, count)).repeat(2)
     heights = torch.tensor([0.3, 0.9]).repeat_interleave(count)
     flat = heights.cos()
@@ -41,7 +41,7 @@ def looking_from(eyes: torch.Tensor) -> Cameras:
 
 
 def photographed(whole: Gaussians, cameras: Cameras) -> Gaussians:
-    """The part of a convex thing that faces some camera."""
+    """Return the part of a convex object that faces some camera."""
     normals = torch.nn.functional.normalize((whole.means - CENTER) / torch.tensor([0.25, 0.09, 0.09]), dim=1)
     towards = torch.nn.functional.normalize(cameras.centers[None] - whole.means[:, None], dim=2)
     return whole.select(((towards * normals[:, None]).sum(2) > 0.1).any(1))
@@ -70,12 +70,12 @@ def test_the_back_of_what_was_photographed_from_one_side_is_opaque_and_has_its_c
     assert 0.1 < closed.guessed_share < 0.45
     inside = render(whole, behind).alpha > 0.9
     assert float((render(closed.gaussians, behind).alpha[inside] > 0.9).float().mean()) > 0.97
-    # the spot in front was seen from behind through the missing back
+    # the missing back showed the front spot from behind
     spots = [greenest(scene, behind) for scene in (seen, closed.gaussians)]
     assert spots[0] > 0.5
     assert spots[1] < 0.1
     assert errors(closed.gaussians, whole, behind) > errors(seen, whole, behind) + 1.5
-    # from where it was photographed hardly anything of it shows
+    # from the photographed side it hardly shows
     assert errors(closed.gaussians, whole, cameras) > 37
 
 
