@@ -34,8 +34,8 @@ _MIN_PARALLAX_DEG = 3.0  # smallest parallax: 1 px of error at a focal length of
 _POINTS, _CAMERAS = 256, 128  # most points and cameras whose parallax is measured, evenly spaced in their order
 _MIN_SIDE_PX = 16  # shorter side; smaller photos hold no window of SSIM (11 px) and no features
 _MEASURED_PX = 800
-"""Longest side at which sharpness is measured, or the median photo's if that is smaller. A larger photo is thus compared
-at the size of the others."""
+"""Longest side at which sharpness is measured, or the median photo's if that is smaller: larger photos are compared at
+the size of the others."""
 _BLUR_OCTAVES = 1.5
 """Smallest difference of a blurred photo's sharpness from the median, octaves. In four captures (three photographed,
 one rendered) the softest photo lies 0.4 to 0.8 below the median. Motion blur of 9 px or a Gaussian blur of 2 px costs

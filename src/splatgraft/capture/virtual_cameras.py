@@ -52,7 +52,8 @@ _CLEAR_AT_EDGES = 0.35  # distance from the camera, over that of the centre; any
 _HEIGHTS = (0.2, 0.6, 0.0)  # heights of cameras within the scene above the centre, in order of preference
 _ELEVATIONS_WITHIN_DEG = (0.0, -25.0)  # elevations of views out of the scene
 _STEP_BACK = 0.3  # horizontal distance of cameras within the scene behind the centre
-_CLEAR_WITHIN, _CLEAR_AT_EDGES_WITHIN = 0.3, 0.15  # as the two above, for cameras within the scene, from the camera
+_CLEAR_WITHIN, _CLEAR_AT_EDGES_WITHIN = 0.3, 0.15
+"""Distances from a camera within the scene; anything nearer occludes the middle of the picture, and the picture."""
 _MIN_SEEN_WITHIN = 0.5  # smallest mean opacity of a picture from within
 _OCCLUDED = 0.1  # occluded share from which a position is rejected
 _MIDDLE_WEIGHT = 0.3  # weight of the occluded share of the middle against that of the whole picture
@@ -131,12 +132,12 @@ def place_virtual_cameras(
     axis = int(up.abs().argmax())
     along = f", so {'xyz'[axis]} is {'up' if up[axis] > 0 else 'down'}" if abs(float(up[axis])) >= _ALIGNED_COS else ""
     text = f"the up direction is {_shown(up)}{along}: {reason}"
-    upside_down = f"If the pictures are upside down or on their side, set up (up = [{_numbers(-up)}] turns them over)"
+    upside_down = f"If the scene is upside down or on its side, set up (up = [{_numbers(-up)}] turns it over)"
     report = [
         Note(
             f"the scene has no photographs: {len(cameras)} pictures are rendered from {options.look} {_shown(centre)}"
         ),
-        Note(text) if is_sure else Note(f"{text}. All pictures depend on it.", "warning", upside_down),
+        Note(text) if is_sure else Note(f"{text}. The picture shows this orientation.", "warning", upside_down),
     ]
     if dropped:
         report.append(Note(f"{dropped} of {options.views} views were left out because something occludes them"))
@@ -190,7 +191,7 @@ def estimate_scene_up(
     customary = normals[:, 1:].abs().amax(1) > _ALIGNED_COS
     best = int((counts * torch.where(customary, 1.0, _UNALIGNED_WEIGHT)).argmax())
     if counts[best] < _MIN_SHARE * len(near):
-        return torch.tensor([0.0, -1.0, 0.0]), "no level surface was found, and this is usual in files", False
+        return torch.tensor([0.0, -1.0, 0.0]), "no level surface was found, and most files have this up", False
     inliers = near[heights[best].abs() < thickness]
     middle = inliers.mean(0)
     normal = least_squares_normal(inliers - middle).float()

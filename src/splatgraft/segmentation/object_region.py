@@ -3,9 +3,9 @@
 1. A user's points in pictures are moved to the surface by the rendered depth.
 2. The region is a 3D box above the support, a table or a wall. It encloses the largest group of surface points near the
    cameras' focus point, or the groups that the user pointed at.
-3. If there are points, each Gaussian of the region belongs to the side, object or background, with the shorter path to
-   it. Paths across a change of colour are longer (geodesic segmentation, Bai and Sapiro 2007, here on the graph of
-   neighbouring Gaussians).
+3. If a user pointed at the object, each Gaussian of the region joins the object or the background, to whichever its
+   path is shorter. Paths across a change of colour are longer (geodesic segmentation, Bai and Sapiro 2007, here on the
+   graph of neighbouring Gaussians).
 
 All constants are set by hand.
 """

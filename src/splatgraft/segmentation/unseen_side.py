@@ -2,8 +2,7 @@
 
 1. The masks carve the visual hull out of a grid of voxels (Laurentini 1994); silhouettes from one side also give the
    outline from the other.
-2. Flat opaque Gaussians are placed on the hull's surface where no camera sees it and the object has no surface behind
-it.
+2. Flat opaque Gaussians are placed on the parts of the hull that no camera sees, unless the object has a surface there.
 3. Their colours continue those at the border of the seen surface (Laplace's equation on the surface).
 4. Gaussians that would show in a photograph are removed.
 """
