@@ -96,11 +96,11 @@ def test_where_less_than_half_is_posed_all_is_done_once_more_and_the_better_mode
     answer(model_of(3, 8) | {"seconds": {"features": 20.0, "mapping": 10.0}}, model_of(7, 8))
     posed, report = pose(photo_paths(tmp_path / "photos", 8), tmp_path, say=said.append)
     assert "took 30 s (features 20, mapping 10)" in said[0]
-    assert "only 3 of 8 photos got a pose: all is done once more with more features" in said[1]
+    assert "only 3 of 8 photos got a pose: structure from motion runs again with more features" in said[1]
     assert "about 20 min" in said[1]
     assert (report.registered, report.photos, report.missing) == (7, 8, (Unposed("07", 900, 12),))
     assert "7 of 8 photos have a pose" in str(report)
-    assert "without a pose: 07 (900 features, at most 12 matches: of another place" in str(report)
+    assert "without a pose: 07 (900 features, at most 12 matches: shows another place" in str(report)
     assert len(posed) == 7
     assert posed.image(0).shape == (30, 40, 3)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["images", "photos", "scratch"]
@@ -114,7 +114,7 @@ def test_what_a_pass_posed_is_a_result_and_more_is_offered_with_its_time(tmp_pat
     assert report.registered == 5
     assert [one.name for one in report.missing] == ["05", "06", "07"]
     assert "photos with a pose: expected at least 70%, found 5 of 8" in said[1]
-    assert 'effort = "thorough" finds more features, which takes about 20 min' in said[1]
+    assert 'effort = "thorough" finds more features, in about 20 min' in said[1]
 
 
 def test_a_full_quick_model_needs_no_second_effort_and_masks_are_undistorted_like_photos(tmp_path, answer):
@@ -153,7 +153,7 @@ def test_photos_on_their_side_are_turned_with_their_masks_and_that_is_said(tmp_p
     assert carried[21:].max() == 0
     assert float(posed.cameras.world_from_camera[:, 2, 0].abs().max()) < 1e-4  # level
     assert float(posed.cameras.world_from_camera[:, 2, 1].max()) < 0  # and not upside down
-    assert "12 of 12 photos lie on their side or upside down and were turned" in said
+    assert "12 of 12 photos lay on their side or upside down and were turned upright" in said
 
 
 def test_a_dying_process_is_reported_in_one_line(tmp_path, monkeypatch):
@@ -310,7 +310,7 @@ def test_true_poses_come_back_and_crops_have_their_optical_axis_where_it_was(tmp
         found, true = (c.world_from_camera[[i, i + 1], :3, :3].double() for c in (posed.cameras, truth))
         turn = found[0].T @ found[1] @ (true[0].T @ true[1]).T
         assert float(turn.trace()) > 1 + 2 * math.cos(6 / 400)
-    assert any("the lens was solved apart" in sentence for sentence in said)
+    assert any("the lens was solved separately" in sentence for sentence in said)
 
 
 @pytest.mark.long

@@ -53,9 +53,9 @@ def test_up_is_the_side_on_which_things_stand(angle: float) -> None:
         # a fiftieth of the radius is the plane's thickness
         assert float(up @ rotation[:, 2]) > math.cos(0.05), why
     _, why, is_sure = turned_up(tilt)
-    assert why.endswith("a guess by custom")
+    assert why.endswith("a guess by the conventions of files")
     assert not is_sure
-    assert turned_up(tilt @ y_down.T)[1].endswith("most things stand")
+    assert turned_up(tilt @ y_down.T)[1].endswith("with most Gaussians")
 
 
 def test_cameras_go_round_the_dense_part_upright_and_see_it() -> None:

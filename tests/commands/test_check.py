@@ -11,8 +11,7 @@ import pytest
 from PIL import Image
 from tiny_project import ball, photograph, plane
 
-from splatgraft.capture.photo_inspection import blur_of
-from splatgraft.capture.usable_views import find_odd_photos
+from splatgraft.capture.usable_views import find_odd_photos, log_sharpness
 from splatgraft.cli import main
 from splatgraft.core.exposure import Exposure
 from splatgraft.formats.captures.exif import exif_of
@@ -189,6 +188,14 @@ def test_what_is_no_capture_is_one_line(
         assert f"{given}: expected" in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_more_blur_is_a_larger_figure() -> None:
-    photo = walk(count=1)[0]
-    assert 0 <= blur_of(photo) < blur_of(cv2.blur(photo, (5, 5))) < blur_of(cv2.blur(photo, (11, 11))) <= 1
+@pytest.mark.parametrize("kernel", [np.ones((1, 9)), np.ones((9, 1)), np.eye(9)])
+def test_camera_motion_in_any_direction_blurs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kernel: np.ndarray
+) -> None:
+    sharp = walk()
+    blurred = [cv2.filter2D(photo, -1, kernel / kernel.sum()) for photo in sharp]
+    more = [cv2.filter2D(photo, -1, kernel / kernel.sum()) for photo in blurred]
+    sharpness = [[log_sharpness(photo.astype(np.float32)) for photo in photos] for photos in (more, blurred, sharp)]
+    assert np.all(np.diff(sharpness, axis=0) > 0)
+    _, findings, _ = check(save(tmp_path / "photos", blurred), capsys)
+    assert findings["sharpness"]["level"] == "doubtful"

@@ -23,8 +23,8 @@ def test_a_transfer_between_two_scene_files(tmp_path: Path, capsys: pytest.Captu
     project = scene_project(tmp_path, mask_source="grabcut", threshold=0.5)
     assert main(["run", str(project), "--to", "consolidate"]) == 0
     said = capsys.readouterr().err
-    assert "a scene without photographs: 8 pictures" in said
-    assert "up is taken to be (0.00, 0.00, 1.00)" in said
+    assert "the scene has no photographs: 8 pictures" in said
+    assert "the up direction is (0.00, 0.00, 1.00)" in said
     root = project.parent
     # guesses are shown
     (guess,) = [note for note in read_record(root / "target" / "capture").warnings if note.in_doubt]

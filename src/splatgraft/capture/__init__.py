@@ -1,4 +1,4 @@
-"""Capture: posed images from photos, from a video, or from a trained scene that comes without images."""
+"""Capture: posed images from photos, a video, or a trained scene without images."""
 
 from splatgraft.capture.metric_scale import scale_from_length, scale_from_marker, triangulate
 from splatgraft.capture.photos import write_reduced

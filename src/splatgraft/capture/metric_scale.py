@@ -1,7 +1,7 @@
-"""Metres per world unit of a capture: from a known length, or from a square marker that the pictures show.
+"""Metric scale of a capture, metres per world unit: from a known length, or from a square marker in the images.
 
-A point is where the rays of its pixels meet by least squares. Markers are AprilTags and ArUco markers of OpenCV's
-dictionaries.
+Points are triangulated by least squares from pixels in several images. Markers are AprilTags and ArUco markers from
+OpenCV's dictionaries.
 """
 
 from collections import defaultdict
@@ -26,20 +26,19 @@ _DICTIONARIES = (
     "DICT_7X7_250",
     "DICT_ARUCO_ORIGINAL",
 )
-"""The dictionaries in common use; the first numbers of a family's larger dictionaries are the same markers."""
-
-
-_MAX_MISS_PX = 3.0
-"""Mean distance, pixels, of a corner, projected, from where it was found: corners are found to a pixel, poses of a
-plausible capture are right to one or two."""
-_MIN_ANGLE = 1e-4  # least sum of squared sines of the angles between the rays of a point: a degree between two
+"""Common dictionaries; a larger dictionary of the same family begins with the same markers."""
+_MAX_MISS_PX = 3.0  # largest reprojection error of a corner: detection is right to 1 px, plausible poses to 1 or 2
+_MIN_ANGLE = 1e-4  # smallest sum of squared sines of the angles between rays: one degree between two rays
 
 
 def triangulate(cameras: Cameras, pixels: Float[Tensor, "v 2"]) -> tuple[Float[Tensor, "3"], float]:
-    """The point nearest to the rays of two or more cameras through one pixel each, x and y.
+    """Triangulate a point from one pixel (x, y) in each of two or more cameras, by least squares.
 
     Returns:
-        The point, world units, and the mean distance of its projections from the given pixels.
+        The point, world units, and its mean reprojection error, pixels.
+
+    Raises:
+        ValueError: The rays are almost parallel.
     """
     homogeneous = torch.cat([pixels.double(), torch.ones(len(pixels), 1, dtype=torch.float64)], 1)[..., None]
     in_camera = torch.linalg.inv(cameras.intrinsics.double()) @ homogeneous
@@ -54,7 +53,7 @@ def triangulate(cameras: Cameras, pixels: Float[Tensor, "v 2"]) -> tuple[Float[T
 
 
 def scale_from_length(ends: tuple[Float[Tensor, "3"], Float[Tensor, "3"]], metres: float) -> MetricScale:
-    """The scale at which the distance of two points is `metres`."""
+    """Compute the scale at which the distance between two points, world units, is `metres`."""
     distance = float((ends[0] - ends[1]).norm())
     if not (distance > 0 and metres > 0):
         raise ValueError(f"--length: expected two points apart and metres above 0, found {distance:g} and {metres:g}")
@@ -68,7 +67,17 @@ def scale_from_marker(
     *,
     progress: Progress = silent,
 ) -> MetricScale:
-    """The scale at which the black square of a marker in the pictures, sRGB in [0, 1], has sides of `side_m` metres."""
+    """Compute the scale at which the black square of the marker seen in most images has sides of `side_m` metres.
+
+    Args:
+        images: sRGB in [0, 1].
+        cameras: One camera per image.
+        side_m: Side of the black square, metres.
+        progress: Called with images done, images in all and a short text.
+
+    Raises:
+        ValueError: No marker is seen in two images, or its corners do not meet.
+    """
     seen = _marker_corners(images, progress)
     several = {key: views for key, views in seen.items() if len(views) >= 2}
     if not several:
@@ -86,13 +95,13 @@ def scale_from_marker(
     sides = (points - points.roll(-1, 0)).norm(dim=1)
     spread = float((sides.amax() - sides.amin()) / sides.mean())
     name = f"{key[0].removeprefix('DICT_')} marker {key[1]} of {side_m:g} m in {len(views)} images"
-    return MetricScale(side_m / float(sides.mean()), f"{name}, sides alike within {spread:.0%}")
+    return MetricScale(side_m / float(sides.mean()), f"{name}, sides equal within {spread:.0%}")
 
 
 def _marker_corners(
     images: Sequence[Float[Tensor, "_ _ 3"]], progress: Progress
 ) -> dict[tuple[str, int], dict[int, Float[np.ndarray, "4 2"]]]:
-    """Corners by dictionary and number of the marker, and index of the picture; centres of pixels at 0.5."""
+    """Find marker corners, by dictionary and id of the marker and then by image; pixel centres are at 0.5."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detectors = {

@@ -1,11 +1,10 @@
-"""What photos tell before poses are sought: sharpness, overlap and brightness, from small grey versions.
+"""Inspection of photos before structure from motion: sharpness, overlap and exposure, from small grey versions.
 
-Overlap is counted in SIFT matches (Lowe 2004: ratio test), verified by epipolar geometry (USAC, MAGSAC++), between
-photos that follow one another; what these do not hold together is compared, as structure from motion does it, with the
-photos that share most of the largest features, wherever in the order they are. The matches of neighbours tell the
-exposure of each photo against the others, as one surface should have one brightness. Sharpness is the perceptual blur
-metric of Crete-Roffet et al. 2007, which depends little on what is shown: how much the picture loses when it is blurred
-once more.
+- Sharpness is that of `usable_views.log_sharpness`.
+- Overlap is the number of SIFT matches (Lowe 2004: ratio test) that satisfy the epipolar geometry (USAC, MAGSAC++).
+  Photos are matched with those that follow in the order of names. Photos that these matches leave unconnected are
+  matched with the photos that share most of their largest features.
+- Exposure is compared between neighbours at their matches, because a surface should have the same brightness in both.
 """
 
 from collections import Counter
@@ -20,61 +19,59 @@ from jaxtyping import UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from splatgraft.capture.usable_views import MIN_VIEWS
+from splatgraft.capture.usable_views import MIN_VIEWS, log_sharpness
 from splatgraft.core.exposure import Exposure, describe_inconsistency
 from splatgraft.core.posed_images import LeftOut
 from splatgraft.runtime.progress import Progress, silent
 
 SIDE_PX = 640
-"""Longest side of the grey versions: that of a draft reconstruction."""
-_FEATURES = 1200  # SIFT features per photo, the strongest
-_NEIGHBOURS = 3  # photos that follow in the order of names (in a ring) with which each is matched
-_RATIO = 0.8  # distance of the best match over that of the second, at most (Lowe 2004)
-_EPIPOLAR_PX = 1.5  # distance of a match from its epipolar line, at most
-_MIN_MATCHES = 15  # verified matches from which two photos show the same place: what COLMAP demands (min_num_inliers)
-_PARTNERS = 4  # photos anywhere in the order with which a photo is matched that its neighbours do not hold
-_PARTNER_FEATURES = 300
-"""Largest features of a photo by which its partners are found (preemptive matching: Wu 2013, section 3)."""
-_STILL_PX = 0.5  # shift below which a match does not move: below what a hand can hold still
+"""Longest side of the grey versions, pixels: that of a draft reconstruction."""
+_FEATURES = 1200  # strongest SIFT features kept per photo
+_NEIGHBOURS = 3  # following photos in name order (cyclic) with which each photo is matched
+_RATIO = 0.8  # largest distance of the best match over that of the second (Lowe 2004)
+_EPIPOLAR_PX = 1.5  # largest distance of a match from its epipolar line
+_MIN_MATCHES = 15  # fewest verified matches between two photos of the same place (COLMAP: min_num_inliers)
+_PARTNERS = 4  # photos of any position with which a photo unconnected to its neighbours is matched
+_PARTNER_FEATURES = 300  # largest features of a photo by which partners are found (Wu 2013, section 3)
+_STILL_PX = 0.5  # largest shift of a match without camera motion: less than a hand can hold still
 
 # limits of the findings, measured on the two captures that ship, two public ones and a rendered room
 _FEW = 20  # photos; the 16 of the shipped bananas are near the limit
-_BLUR_OF_ALL = 0.5
-"""Median blur. Sharp captures have 0.23 to 0.37; motion by 5 pixels at 640 lifts these to 0.4 to 0.54."""
-_JUMP_STOPS = 0.4
-"""Brightness of a photo against those before and after, as of the exposure settings; captures of fixed exposure have up
-to 0.31."""
-_MIN_TOGETHER = 0.5  # share of the photos that hang together: what structure from motion demands of poses
-_NAMED = 6  # photos that a finding names; it counts the others
+_SHARP_MEDIAN = -1.8
+"""Smallest median sharpness of a sharp capture, octaves. Ten captures (seven photographed, three rendered) have -1.2 to
+0.6; with motion blur of 9 px at 640 px, -3.6 to -1.8."""
+_JUMP_STOPS = 0.4  # largest brightness difference from both neighbours; captures of fixed exposure have up to 0.31
+_MIN_TOGETHER = 0.5  # smallest share of connected photos: structure from motion demands as many poses
+_NAMED = 6  # most photos that a finding names
 
 Grey = UInt8[np.ndarray, "h w"]
-"""sRGB luma."""
+"""sRGB luma of a photo."""
 Level = Literal["good", "doubtful", "unusable"]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found on one subject, and what it means for a reconstruction."""
+    """Result of an inspection on one subject."""
 
     subject: str
-    """One word, such as "overlap"."""
+    """Subject in one word, such as "overlap"."""
     level: Level
-    """What it means for a reconstruction."""
+    """Suitability for a reconstruction."""
     text: str
-    """What was found, on one line."""
+    """Observation, one line."""
     remedy: str = ""
-    """What to do, on one line; empty where nothing need be done."""
+    """Advice, one line; empty if nothing needs to be done."""
     photos: tuple[str, ...] = ()
-    """Names of the photos that it is about."""
+    """Names of the affected photos."""
 
     def __str__(self) -> str:
-        """One line for people."""
+        """Return observation and advice in one line."""
         return self.text + (f"; {self.remedy}" if self.remedy else "")
 
 
 @dataclass(frozen=True)
 class _Features:
-    """Of one photo, the largest first."""
+    """SIFT features of one photo, the largest first."""
 
     points: np.ndarray
     descriptors: np.ndarray
@@ -88,23 +85,27 @@ class _Link:
     first: int
     second: int
     matches: int
-    """Verified."""
+    """Number of verified matches."""
     stops: float
-    """How much brighter the second photo shows the same surfaces, median over matches."""
+    """Median brightness of the second photo over the first at the matches, stops."""
 
 
 def find_in_photos(
     photos: Iterable[Grey], names: Sequence[str], *, has_poses: bool, progress: Progress = silent
 ) -> tuple[Finding, ...]:
-    """Sharpness, overlap and brightness of photos in the order in which they were taken, read one at a time.
+    """Inspect sharpness, overlap and exposure of photos, which are read one at a time.
 
-    Their longest side is `SIDE_PX` at most. Photos that have poses need no matches.
+    Args:
+        photos: Luma in the order in which the photos were taken, the longest side at most `SIDE_PX`.
+        names: Names of the photos.
+        has_poses: Whether the photos have poses and so need no matches.
+        progress: Called with photos done, photos in all and a short text.
     """
-    blur: list[float] = []
+    sharpness: list[float] = []
     features: list[_Features] = []
     n, sift = len(names), cv2.SIFT.create(nfeatures=_FEATURES)
     for index, photo in enumerate(photos):
-        blur.append(blur_of(photo))
+        sharpness.append(log_sharpness(photo.astype(np.float32)))
         features.append(_features(sift, photo))
         progress(index + 1, n, "looking at photos")
     found: dict[tuple[int, int], _Link | None] = {}
@@ -127,24 +128,11 @@ def find_in_photos(
     overlap = _overlap(found, names)
     if has_poses and overlap.level != "good":
         overlap = Finding("overlap", "good", f"{overlap.text}; poses are given, which need none", photos=overlap.photos)
-    return _sharpness(blur), overlap, _exposure(links, names)
-
-
-def blur_of(photo: Grey) -> float:
-    """Perceptual blur in [0, 1] (Crete-Roffet et al. 2007): share of the differences between neighbouring pixels that
-    a box filter of 9 pixels leaves, along the axis where more is left."""
-    pixels = photo.astype(np.float32)
-    found = []
-    for axis, size in ((0, (1, 9)), (1, (9, 1))):
-        sharp = np.abs(np.diff(pixels, axis=axis))
-        blurred = np.abs(np.diff(cv2.blur(pixels, size), axis=axis))
-        total = float(sharp.sum())
-        found.append(1.0 if total == 0 else 1 - float(np.maximum(0, sharp - blurred).sum()) / total)
-    return max(found)
+    return _sharpness(sharpness), overlap, _exposure(links, names)
 
 
 def _groups(count: int, found: Mapping[tuple[int, int], _Link | None]) -> list[list[int]]:
-    """Photos that hang together by links, the largest group first."""
+    """Return the connected components of the photos under their links, the largest first."""
     rows = np.array([pair for pair, link in found.items() if link is not None], int).reshape(-1, 2)
     graph = coo_array((np.ones(len(rows), bool), (rows[:, 0], rows[:, 1])), shape=(count, count))
     number, label = connected_components(graph, directed=False)
@@ -159,16 +147,16 @@ def _features(sift: cv2.SIFT, photo: Grey) -> _Features:
     points, descriptors = np.array([keypoints[k].pt for k in largest], np.float32), descriptors[largest]
     # Hellinger distance (RootSIFT, Arandjelovic and Zisserman 2012)
     descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-6))
-    # display values to light: a power is enough for ratios
+    # display values to linear light; a power is accurate enough for ratios
     light = cv2.blur((photo.astype(np.float32) / 255) ** 2.2, (9, 9))
     rows, columns = (points.astype(int)[:, k].clip(0, photo.shape[1 - k] - 1) for k in (1, 0))
     return _Features(points, descriptors.astype(np.float32), light[rows, columns])
 
 
 def _partners(features: Sequence[_Features], i: int, others: Sequence[int]) -> list[int]:
-    """Those of `others` whose largest features match those of photo `i` best, the best first."""
+    """Return the photos among `others` whose largest features match those of photo `i` best, the best first."""
     largest = [features[j].descriptors[:_PARTNER_FEATURES] for j in others]
-    # one product for all, since many small ones cost more
+    # one product for all costs less than many small ones
     cosines = features[i].descriptors[:_PARTNER_FEATURES] @ np.concatenate(largest).T
     ends = np.cumsum([len(one) for one in largest])[:-1]
     counted = {
@@ -179,22 +167,22 @@ def _partners(features: Sequence[_Features], i: int, others: Sequence[int]) -> l
 
 
 def _distinct(cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows and columns of cosines of unit vectors that are nearest to each other and much nearer than the second.
+    """Return the rows and columns of mutual nearest neighbours that pass the ratio test, given unit vectors' cosines.
 
-    The best of each row is overwritten.
+    The largest value of each row is overwritten.
     """
     rows = np.arange(len(cosine))
     best = cosine.argmax(1)
     nearest = cosine[rows, best]
     mutual = cosine.argmax(0)[best] == rows
     cosine[rows, best] = -1
-    # of unit vectors the squared distance is 2 - 2 cos
+    # the squared distance of unit vectors is 2 - 2 cos
     kept = np.flatnonzero(mutual & (1 - nearest < _RATIO**2 * (1 - cosine.max(1))))
     return kept, best[kept]
 
 
 def _link(features: Sequence[_Features], i: int, j: int) -> _Link | None:
-    """The verified matches of two photos; None where there are too few."""
+    """Match two photos and verify the matches; None if these are too few."""
     one, other = features[i], features[j]
     if min(len(one.points), len(other.points)) < _MIN_MATCHES:
         return None
@@ -210,7 +198,7 @@ def _link(features: Sequence[_Features], i: int, j: int) -> _Link | None:
 
 
 def _verified(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Which matches lie on their epipolar lines, or do not move at all, for which such lines are not defined."""
+    """Test which matches lie on their epipolar lines, or, if most do not move and these are undefined, do not move."""
     still = np.linalg.norm(a - b, axis=1) < _STILL_PX
     if still.mean() > 0.5:
         return still
@@ -223,20 +211,20 @@ def _verified(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def find_in_sizes(sizes: Sequence[tuple[int, int]], names: Sequence[str]) -> Finding:
-    """The number of photos of each size, upright or on the side."""
-    # a photo held on its side is of the same camera
+    """Compare the sizes of photos; portrait and landscape count as one size."""
+    # a camera takes both
     (width, height), most = Counter((max(size), min(size)) for size in sizes).most_common(1)[0]
     odd = tuple(name for name, size in zip(names, sizes, strict=True) if (max(size), min(size)) != (width, height))
     if not odd:
         return Finding("sizes", "good", f"all {len(sizes)} photos have {width} x {height} px")
-    text = f"{most} of {len(sizes)} photos have {width} x {height} px, {len(odd)} another: {_named(odd)}"
-    return Finding("sizes", "doubtful", text, "one camera and one zoom are best; capture uses all that fit", odd)
+    text = f"{most} of {len(sizes)} photos have {width} x {height} px, {len(odd)} another size: {_named(odd)}"
+    return Finding("sizes", "doubtful", text, "use one camera and one zoom setting; capture keeps all that fit", odd)
 
 
 def find_in_exposures(exposures: Sequence[Exposure]) -> Finding:
-    """What the cameras' settings say."""
+    """Compare the exposure settings in EXIF."""
     if all(one.ev100 is None for one in exposures):
-        return Finding("settings", "good", "no exposure settings in EXIF, so that they cannot be compared")
+        return Finding("settings", "good", "EXIF has no exposure settings to compare")
     differs = describe_inconsistency(exposures)
     return Finding(
         "settings",
@@ -246,37 +234,42 @@ def find_in_exposures(exposures: Sequence[Exposure]) -> Finding:
 
 
 def find_in_count(count: int) -> Finding:
-    """Whether the photos are enough."""
+    """Judge the number of photos."""
     text = f"{count} photos"
     if count < MIN_VIEWS:
         return Finding("count", "unusable", text, f"take at least {_FEW}, better 40 to 120")
     if count < _FEW:
-        return Finding("count", "doubtful", f"{text}, which is few", "take 40 to 120 from all sides")
+        return Finding("count", "doubtful", f"{text}, fewer than {_FEW}", "take 40 to 120 from all sides")
     return Finding("count", "good", text)
 
 
 def find_in_odd_photos(odd: Sequence[LeftOut], count: int) -> Finding:
-    """The photos that the command `capture` leaves out, of `count`; at least one."""
+    """Report the photos, at least one of `count`, that the command `capture` leaves out."""
     names = tuple(Path(one.name).name for one in odd)
     level: Level = "unusable" if 2 * len(odd) > count else "doubtful"
     text = f"capture leaves out {len(odd)} of {count} photos: {_named(names)}"
-    # the reason begins with the file's whole path, which the text has named already
+    # the reason begins with the full path, and the text has named the file
     why = odd[0].reason.removeprefix(f"{odd[0].name}: ")
     return Finding("left out", level, text, f"{names[0]}: {why}", names)
 
 
 def _named(photos: Sequence[str]) -> str:
-    """The first of some names, and how many more there are."""
+    """List the first names, and the number of further ones."""
     more = f" and {len(photos) - _NAMED} more" if len(photos) > _NAMED else ""
     return ", ".join(photos[:_NAMED]) + more
 
 
-def _sharpness(blur: Sequence[float]) -> Finding:
-    middle = float(np.median(blur))
-    if middle > _BLUR_OF_ALL:
-        text = f"most photos are blurred (median blur {middle:.2f}, sharp captures have 0.23 to 0.37)"
+def _sharpness(sharpness: Sequence[float]) -> Finding:
+    known = np.array(sharpness)[np.isfinite(sharpness)]
+    if not len(known):
+        text = "the photos are too plain or too small to measure sharpness"
+        return Finding("sharpness", "doubtful", text, "take larger photos with texture in view")
+    middle = float(np.median(known))
+    if middle < _SHARP_MEDIAN:
+        text = f"most photos are blurred (fine over coarse detail {2**middle:.2f}, sharp captures have 0.44 to 1.5)"
         return Finding("sharpness", "doubtful", text, "photograph again with shorter exposure and in focus")
-    return Finding("sharpness", "good", f"the photos are sharp (blur {min(blur):.2f} to {max(blur):.2f})")
+    low, high = 2 ** known.min(), 2 ** known.max()
+    return Finding("sharpness", "good", f"the photos are sharp (fine over coarse detail {low:.2f} to {high:.2f})")
 
 
 def _overlap(found: Mapping[tuple[int, int], _Link | None], names: Sequence[str]) -> Finding:
@@ -285,22 +278,22 @@ def _overlap(found: Mapping[tuple[int, int], _Link | None], names: Sequence[str]
     next_to = [link.matches for link in found.values() if link is not None and link.second - link.first == 1]
     middle = f"{np.median(next_to):.0f}" if next_to else "no"
     if len(largest) == n:
-        return Finding("overlap", "good", f"all photos hang together, {middle} matches between neighbours")
+        return Finding("overlap", "good", f"all photos are connected, {middle} matches between neighbours")
     apart = tuple(names[i] for group in groups[1:] for i in group)
     if len(largest) < _MIN_TOGETHER * n:
-        text = f"only {len(largest)} of {n} photos show one place together; the largest groups have "
+        text = f"only {len(largest)} of {n} photos show one place together; photos in the largest groups: "
         sizes = ", ".join(str(len(group)) for group in groups[:4])
-        remedy = "take photos a step apart that share two thirds of the picture, with texture in view, of one place"
+        remedy = "take photos of one place, a step apart, with two thirds overlap and texture in view"
         return Finding("overlap", "unusable", text + sizes, remedy, apart)
     text = f"{len(apart)} of {n} photos share little with the others and may get no pose: {_named(apart)}"
-    # more features may still hold them, and they then hold others
+    # structure from motion has more features, so these photos may still get a pose and connect others
     return Finding("overlap", "doubtful", text, "keep them, and take photos between them and the rest", apart)
 
 
 def _exposure(links: Sequence[_Link], names: Sequence[str]) -> Finding:
-    """By links of neighbours, how much brighter each photo shows surfaces than those before and after it do.
+    """Find photos that are brighter or darker than the photos before and after them, at the matches of neighbours.
 
-    Gloss changes smoothly from photo to photo, so that it cancels; a change of exposure does not.
+    Gloss changes smoothly from photo to photo and so cancels; a change of exposure does not.
     """
     before: list[list[float]] = [[] for _ in names]
     after: list[list[float]] = [[] for _ in names]
@@ -312,6 +305,6 @@ def _exposure(links: Sequence[_Link], names: Sequence[str]) -> Finding:
     largest_first = sorted(range(len(names)), key=lambda i: -jumps[i])
     odd = tuple(names[i] for i in largest_first if jumps[i] > _JUMP_STOPS)
     if odd:
-        text = f"{len(odd)} photos are up to {max(jumps):.1f} stops off their neighbours in brightness: {_named(odd)}"
+        text = f"brightness of {len(odd)} photos differs from neighbours by up to {max(jumps):.1f} stops: {_named(odd)}"
         return Finding("exposure", "doubtful", text, "lock exposure and white balance next time", odd)
-    return Finding("exposure", "good", f"neighbours agree in brightness within {max(jumps):.2f} stops")
+    return Finding("exposure", "good", f"the brightness of neighbours agrees within {max(jumps):.2f} stops")

@@ -1,4 +1,4 @@
-"""Photos made ready for structure from motion, grouped by camera, reduced, and freed of distortion after it."""
+"""Photos before and after structure from motion: reduced upright copies, groups by camera, undistorted images."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,11 +20,15 @@ from splatgraft.runtime.progress import Progress, silent
 
 
 def working_copies(photos: Sequence[Path], folder: Path, max_size_px: int) -> list[Path]:
-    """Upright copies, at most `max_size_px` on the longest side, that keep the EXIF focal length."""
+    """Write upright copies with their EXIF data, at most `max_size_px` on the longest side.
+
+    Raises:
+        ValueError: Two photos have the same name.
+    """
     names = [photo.stem + ".jpg" for photo in photos]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise ValueError(f"{photos[0].parent}: expected one photo per name, found several of {Path(twice[0]).stem!r}")
+        raise ValueError(f"{photos[0].parent}: expected one photo per name, found several {Path(twice[0]).stem!r}")
     folder.mkdir(parents=True, exist_ok=True)
     for photo, name in zip(photos, names, strict=True):
         with opened(photo) as image:
@@ -37,7 +41,7 @@ def working_copies(photos: Sequence[Path], folder: Path, max_size_px: int) -> li
 
 
 def _on_black(image: Image.Image) -> Image.Image:
-    """RGB; what is transparent is black, as for `read_rgb`."""
+    """Convert to RGB, with transparent pixels black (like `read_rgb`)."""
     if not image.has_transparency_data:
         return image.convert("RGB")
     image = image.convert("RGBA")
@@ -45,10 +49,12 @@ def _on_black(image: Image.Image) -> Image.Image:
 
 
 def working_masks(masks: Sequence[Path | None], copies: Sequence[Path], folder: Path) -> dict[str, Path]:
-    """Masks by the name of their copy, at its size, as COLMAP wants them: NAME.jpg.png, black where nothing counts.
+    """Write masks in COLMAP's form: NAME.jpg.png, the size of the copy, black where features are ignored.
 
-    A mask is upright as its photo is shown: its pixels as they are, or turned by the EXIF orientation of a photo whose
-    alpha channel it is.
+    A mask file is already upright. A mask in the alpha channel of a photo is turned by the photo's EXIF orientation.
+
+    Returns:
+        Masks by the name of their copy.
     """
     written: dict[str, Path] = {}
     for mask, copy in zip(masks, copies, strict=bool(masks)):
@@ -69,7 +75,7 @@ def working_masks(masks: Sequence[Path | None], copies: Sequence[Path], folder: 
 
 
 def _saved_exif(image: Image.Image) -> bytes:
-    """The metadata of an upright copy; none where they are damaged."""
+    """Return the EXIF data for an upright copy, empty if damaged."""
     try:
         exif = image.getexif()
         exif[Base.Orientation] = 1
@@ -79,7 +85,10 @@ def _saved_exif(image: Image.Image) -> bytes:
 
 
 def camera_groups(copies: Sequence[Path], shared: bool) -> list[list[str]]:
-    """File names of the working copies by camera, where `shared`: equal size and EXIF maker, model, focal length."""
+    """Group the file names of working copies by camera.
+
+    If `shared`, photos of equal size and EXIF (maker, model, focal length) share a camera. Otherwise each has its own.
+    """
     if not shared:
         return [[copy.name] for copy in copies]
     groups: dict[tuple[object, ...], list[str]] = {}
@@ -99,12 +108,17 @@ def _camera_traits(copy: Path) -> tuple[object, ...]:
 def write_undistorted(
     copy: Path, path: Path, distortion: Distortion, *, mask: tuple[Path, Path] | None = None, quarters: int = 0
 ) -> Float[Tensor, "3 3"]:
-    """Write the pinhole image of `copy` to `path` as JPEG with its exposure metadata, and of a mask (from, to) as PNG.
+    """Undistort a photo and its mask, turn them, and write them as JPEG with exposure metadata and as PNG.
 
-    Both are turned counterclockwise by `quarters`.
+    Args:
+        copy: Photo to undistort.
+        path: JPEG to write.
+        distortion: Lens of the photo.
+        mask: Mask to undistort, and PNG to write.
+        quarters: Counterclockwise quarter turns.
 
     Returns:
-        The pinhole's matrix, before they are turned.
+        Intrinsics of the undistorted image before it is turned, pixels.
     """
     width, height = distortion.size
     intrinsics = torch.from_numpy(distortion.pinhole())
@@ -118,9 +132,9 @@ def write_undistorted(
 
 
 def write_reduced(posed: PosedImages, folder: Path, longest_px: int, *, progress: Progress = silent) -> PosedImages:
-    """The capture at `longest_px` at most; larger image files are reduced once and written to `folder`, undistorted.
+    """Limit the longest side of a capture's images to `longest_px`.
 
-    Smaller images are referred to as before.
+    Larger images are undistorted, reduced and written to `folder`. Smaller ones keep their files.
     """
     limited = posed.limited(longest_px)
     stems = [Path(name).stem for name in posed.cameras.names]
@@ -150,7 +164,7 @@ def write_reduced(posed: PosedImages, folder: Path, longest_px: int, *, progress
 
 
 def _write_jpeg(path: Path, pixels: Float[Tensor, "h w 3"], photo: Path) -> None:
-    """Write sRGB in [0, 1] with the exposure metadata of `photo`."""
+    """Write sRGB in [0, 1] as JPEG with the exposure metadata of `photo`."""
     array = (pixels.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
     with atomic_write(path) as stream:
         Image.fromarray(array).save(stream, "JPEG", quality=95, subsampling=0, exif=exif_of(read_exposure(photo)))

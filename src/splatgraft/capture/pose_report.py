@@ -1,7 +1,7 @@
-"""What structure from motion found, in figures, which of them are not plausible, and the file with them.
+"""Report of structure from motion: its figures, the implausible ones among them, and their file.
 
-A wrong model often has all photos and a small reprojection error, since COLMAP drops what does not fit. The share of
-verified matches that the model explains does not have this weakness: it counts what was dropped.
+A wrong model often poses all photos with a small reprojection error, because COLMAP drops what does not fit. The
+explained share of verified matches has no such weakness, because it counts what was dropped.
 """
 
 from collections.abc import Sequence
@@ -14,109 +14,104 @@ from splatgraft.formats.json_file import load, save
 
 POSE_REPORT_FILE = "pose_report.json"
 
-_FEW_FEATURES = 500
-"""Features; a photo of a usual scene has some thousands, of which one in ten is found again in the next photo."""
-_FEW_MATCHES = 30  # matches that a pose takes (COLMAP: abs_pose_min_num_inliers)
+_FEW_FEATURES = 500  # most photos have thousands, one in ten of them matches in the next photo
+_FEW_MATCHES = 30  # fewest matches for a pose (COLMAP: abs_pose_min_num_inliers)
 
-# the ranges of the figures of ordinary photos
-_MIN_REGISTERED = 0.7
-"""Share of photos with a pose: without a third of them it is still a result, whose missing photos are named."""
-_MIN_EXPLAINED = 0.5
-"""Share of verified matches: more than half. Models of the shipped room, vase and bananas: 0.59 to 0.87."""
-_MAX_REPROJECTION_PX = 1.0  # pixels: three times the third of a pixel to which SIFT places a feature (Lowe 2004)
-_MIN_OBSERVATIONS = 100  # points seen by the median photo: what COLMAP demands of the first pair (init_min_num_inliers)
+# plausible ranges of the figures
+_MIN_REGISTERED = 0.7  # share of photos with a pose; a result with fewer is usable, but a third is missing
+_MIN_EXPLAINED = 0.5  # explained share of verified matches; the shipped room, vase and bananas have 0.59 to 0.87
+_MAX_REPROJECTION_PX = 1.0  # three times SIFT's accuracy of a third of a pixel (Lowe 2004)
+_MIN_OBSERVATIONS = 100  # points seen by the median photo (COLMAP demands this of the first pair: init_min_num_inliers)
 _FOCAL_IN_SIDES = (0.4, 4.0)  # focal length over the longest side: 14 mm and 140 mm on a sensor of 36 mm
-_MAX_CORNER_SHIFT = 0.25
-"""Share of its distance from the middle by which a corner is moved; more is a fisheye, which is not modelled."""
-_MAX_CORNER_SPREAD = 0.1
-"""Difference of corner shift between the 10th and 90th percentile of photos: one lens at a few zoom settings."""
+_MAX_CORNER_SHIFT = 0.25  # shift of a corner by distortion, over its distance from the centre; a fisheye has more
+_MAX_CORNER_SPREAD = 0.1  # 90th minus 10th percentile of the corner shift: one lens at a few zoom settings
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera as structure from motion found it, and the photos that share it."""
+    """An estimated camera and the photos that share it."""
 
     photos: tuple[str, ...]
-    """Names, without suffix."""
+    """Names of the photos, without suffix."""
     size: tuple[int, int]
-    """Width and height of these photos (shrunk), pixels."""
+    """Width and height of the reduced photos, pixels."""
     focal_px: float
-    """Focal length, pixels of the (shrunk) photos."""
+    """Focal length, pixels of the reduced photos."""
     distortion: float
     """First radial coefficient (k of COLMAP's SIMPLE_RADIAL), for image coordinates over the focal length."""
 
     @property
     def corner_shift(self) -> float:
-        """How far distortion moves a corner of the photo, as a signed share of its distance from the middle."""
+        """Signed shift of a corner by distortion, over its distance from the centre of the photo."""
         width, height = self.size
         return self.distortion * (width**2 + height**2) / (2 * self.focal_px) ** 2
 
 
 @dataclass(frozen=True)
 class Unposed:
-    """A photo without a pose, and what speaks for a reason."""
+    """A photo without a pose, with the figures that hint at the reason."""
 
     name: str
-    """Without suffix."""
+    """Name, without suffix."""
     features: int
-    """Found in it."""
+    """Number of features."""
     matches: int
-    """Verified matches with the photo that it has most in common with."""
+    """Verified matches with the photo that matches best."""
 
     def __str__(self) -> str:
-        """The name, and the usual reason for such figures."""
+        """Return the name and the usual reason for such figures."""
         if self.features < _FEW_FEATURES:
             reason = "blurred, dark or without texture"
         elif self.matches < _FEW_MATCHES:
-            reason = "of another place, or too far from the next photo"
+            reason = "shows another place, or is too far from the next photo"
         else:
-            reason = "something moved, is mirrored or repeats itself, or a step is missing"
+            reason = "something moved, is mirrored or repeats itself, or a photo between two views is missing"
         return f"{self.name} ({self.features} features, at most {self.matches} matches: {reason})"
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """One figure that is out of its range."""
+    """A figure outside its plausible range."""
 
     what: str
-    """What was measured."""
+    """Name of the figure."""
     found: str
-    """With unit."""
+    """Measured value, with unit."""
     expected: str
-    """With unit."""
+    """Plausible range, with unit."""
 
     def __str__(self) -> str:
-        """A clause for people."""
+        """Return the doubt as a clause."""
         return f"{self.what}: expected {self.expected}, found {self.found}"
 
 
 @dataclass(frozen=True)
 class PoseReport:
-    """How well structure from motion went."""
+    """Figures of a structure from motion."""
 
     photos: int
-    """Photos given."""
+    """Number of photos given."""
     registered: int
-    """Photos that have a pose now."""
+    """Number of photos with a pose."""
     missing: tuple[Unposed, ...]
-    """The others."""
+    """Photos without a pose."""
     mean_reprojection_px: float
-    """Mean distance between where points are seen and where they project, pixels of the (shrunk) photos."""
+    """Mean reprojection error, pixels of the reduced photos."""
     points: int
-    """Sparse points kept: seen by three photos or more, at most 1.5 px off."""
+    """Number of sparse points kept: seen by three photos or more, with a mean error of at most 1.5 px."""
     models: int
-    """Separate models found; the best was taken."""
+    """Number of separate models found; the best was kept."""
     method: str
-    """Which of the mappings was taken."""
+    """Mapper, choice of pairs and masks of the model that was kept."""
     explained: float
     """Share of all verified matches whose two features see one point, in [0, 1]."""
     lenses: tuple[Lens, ...]
-    """Cameras found, those of most photos first."""
+    """Estimated cameras, those with most photos first."""
     doubts: tuple[Doubt, ...]
-    """Figures that are not plausible; none where all is well."""
+    """Figures that are not plausible; empty if all are."""
 
     def __str__(self) -> str:
-        """One line for people."""
+        """Return the figures in one line."""
         line = (
             f"{self.registered} of {self.photos} photos have a pose, with a mean reprojection error of "
             f"{self.mean_reprojection_px:.2f} px over {self.points:,} points"
@@ -126,20 +121,20 @@ class PoseReport:
             line += f", focal length {low:.0f} px" if low == high else f", focal lengths {low:.0f} to {high:.0f} px"
         alone = [lens.photos[0] for lens in self.lenses if len(lens.photos) == 1]
         if alone and len(alone) < len(self.lenses):
-            line += f"; with a camera of their own: {', '.join(alone)}"
+            line += f"; photos with their own camera: {', '.join(alone)}"
         return line + (f"; without a pose: {', '.join(map(str, self.missing))}" if self.missing else "")
 
 
 def find_doubts(
     photos: int, observations: Sequence[int], *, explained: float, mean_reprojection_px: float, lenses: Sequence[Lens]
 ) -> tuple[Doubt, ...]:
-    """All figures that are out of the range of ordinary photos; none where the cameras are plausible.
+    """Find the figures outside their plausible ranges.
 
     Args:
         photos: Number of photos given.
-        observations: Points seen, per photo with a pose.
+        observations: Number of points seen, for each photo with a pose.
         explained: Share of verified matches that the model explains, in [0, 1].
-        mean_reprojection_px: Pixels of the (shrunk) photos.
+        mean_reprojection_px: Mean reprojection error, pixels of the reduced photos.
         lenses: Cameras of the photos with a pose.
     """
     doubts: list[Doubt] = []
@@ -177,7 +172,7 @@ def write_pose_report(folder: Path, report: PoseReport) -> None:
 
 
 def read_doubts(folder: Path) -> tuple[Doubt, ...]:
-    """The doubts about the poses of a folder; none where structure from motion did not find them."""
+    """Read the doubts about the poses in a folder; none if they do not come from structure from motion."""
     path = folder / POSE_REPORT_FILE
     if not path.is_file():
         return ()

@@ -1,4 +1,7 @@
-"""Poses, intrinsics and sparse points of photos by COLMAP, which runs in a process of its own (colmap_process/)."""
+"""Structure from motion: camera poses, intrinsics and sparse points of photos, computed by COLMAP.
+
+COLMAP runs in a process of its own (colmap_process/). Its model is checked, undistorted and set upright here.
+"""
 
 import json
 import sys
@@ -31,35 +34,33 @@ _ADVICE = (
     "take more photos, a step apart, with two thirds overlap, sharp, of a still scene with texture around plain or "
     "shiny things, at one zoom setting (or say that each photo has its own camera: lens = each)"
 )
-_EXHAUSTIVE = 80  # most photos of which all pairs are compared unless asked for
-_ENOUGH = 0.5  # share of the photos that need a pose; the rest is named and left out
-_THOROUGH_COST = 40
-"""Time of a thorough attempt over that of a quick one: features of affine shape, more of them, guided matching."""
-_SECONDS_PER_PHOTO = 1.7  # on two idle cores: 80 photos of 1280 px took 118 s, 50 of 1600 px 91 s
+_EXHAUSTIVE = 80  # largest number of photos for which all pairs are matched by default
+_ENOUGH = 0.5  # smallest share of photos with a pose; photos without one are named and left out
+_THOROUGH_COST = 40  # time of a thorough attempt over that of a quick one (more, affine features; guided matching)
 
 
 @dataclass(frozen=True)
 class PoseOptions:
-    """How structure from motion is run."""
+    """Options of structure from motion."""
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which pairs are compared first: all, or neighbours in name order; `auto` is exhaustive for up to 80 photos."""
+    """Pairs that are matched first: all, or neighbours in name order; `auto` is exhaustive for up to 80 photos."""
     effort: Literal["auto", "quick", "thorough"] = "auto"
-    """`thorough` finds and matches more features at about 20 times the cost; `auto` does so where quick poses
-    less than half of the photos."""
+    """`thorough` finds and matches more features at about 20 times the cost; `auto` does so if quick poses
+    fewer than half of the photos."""
     lens: Literal["shared", "each"] = "shared"
     """Whether photos of equal size and EXIF (maker, model, focal length) share a camera, or each has its own."""
     max_size_px: int = 1600
-    """Larger photos are shrunk to this longest side first."""
+    """Longest side to which larger photos are reduced first, pixels."""
     threads: int = 2
     """CPU threads."""
     seed: int = 0
-    """For the random choices of matching and mapping."""
+    """Seed of the random choices of matching and mapping."""
 
 
 def predict_pose_seconds(photos: int) -> float:
-    """Seconds in which photos get poses on two idle cores, half or twice that; a second, thorough attempt apart."""
-    return _SECONDS_PER_PHOTO * photos
+    """Predict the seconds of a quick attempt on two idle cores, within a factor of 2."""
+    return 1.7 * photos  # 80 photos of 1280 px took 118 s, 50 of 1600 px 91 s
 
 
 def pose_photos(
@@ -71,19 +72,22 @@ def pose_photos(
     progress: Progress = silent,
     say: Callable[[str], None] = lambda sentence: None,
 ) -> tuple[PosedImages, PoseReport]:
-    """Poses, intrinsics and sparse points of `photos`; upright undistorted images are written to `workspace`/images.
+    """Compute poses, intrinsics and sparse points of photos, and write the undistorted images.
 
-    World: +z up, the support plane at z = 0, median camera distance 1 (see `upright`). Masks of the photos go to
-    `workspace`/masks, undistorted as well.
+    The images go to `workspace`/images, upright; undistorted masks go to `workspace`/masks. In the world, +z is up, the
+    support plane is z = 0, and the median camera distance is 1 (see `upright`).
 
     Args:
-        photos: At least three, of different names; their masks are used where the whole photos give too little.
+        photos: At least three photos with different names; masks restrict the features if whole photos give too few.
         workspace: An existing folder.
-        scratch: A folder for features, matches and models, which a run of the same photos and options that was killed
-            left to this one; made where there is none.
-        options: How structure from motion is run.
-        progress: Moves a bar.
-        say: Takes a sentence before a longer part begins, and the time that each part took.
+        scratch: Folder for features, matches and models, made if missing. A run of the same photos and options
+            continues from what a killed run left there.
+        options: Options of structure from motion.
+        progress: Called with parts done, parts in all and a short text.
+        say: Called with one sentence before a long part, and with the time that each part took.
+
+    Raises:
+        ValueError: pycolmap is missing, COLMAP fails, or fewer than half of the photos get a pose.
     """
     if find_spec("pycolmap") is None:
         raise ValueError("photos without poses: expected pycolmap (pip install 'splatgraft[sfm]'), found none")
@@ -111,14 +115,14 @@ def pose_photos(
         if latest.registered >= _ENOUGH * len(copies):
             if latest.doubts and effort == "quick":
                 doubts = "; ".join(map(str, latest.doubts))
-                say(f'doubtful ({doubts}); effort = "thorough" finds more features, which takes about {minutes} min')
+                say(f'poses are doubtful ({doubts}); effort = "thorough" finds more features, in about {minutes} min')
             break
         if effort != efforts[-1]:
             say(
-                f"only {latest.registered} of {len(copies)} photos got a pose: all is done once more with more "
-                f"features, which takes about {minutes} min"
+                f"only {latest.registered} of {len(copies)} photos got a pose: structure from motion runs again with "
+                f"more features, which takes about {minutes} min"
             )
-    # by the score of colmap_process/scores.py, where the number of photos is the same for both
+    # the score of colmap_process/scores.py; both attempts have the same number of photos
     model, report = max(found, key=lambda pair: pair[1].explained * pair[1].registered)
     if report.registered < _ENOUGH * len(copies):
         raise ValueError(
@@ -128,7 +132,7 @@ def pose_photos(
     progress(total - 1, total, "undistorting")
     posed, on_their_side = _posed_images(model, copies[0].parent, masks, workspace)
     if on_their_side:
-        say(f"{on_their_side} of {len(posed)} photos lie on their side or upside down and were turned")
+        say(f"{on_their_side} of {len(posed)} photos lay on their side or upside down and were turned upright")
     progress(total, total, str(report))
     return posed, report
 
@@ -163,7 +167,7 @@ def _report(model: Mapping[str, Any], copies: Sequence[Path]) -> PoseReport:
 
 
 def _good_points(model: Mapping[str, Any]) -> Float[Tensor, "m 8"]:
-    """Sparse points that count: place, colour in bytes, error, and the number of photos that see them."""
+    """Return the reliable sparse points: position, colour in bytes, error in pixels, number of photos that see it."""
     rows = torch.tensor(model["points"]).reshape(-1, 8)
     return rows[(rows[:, 7] >= MIN_TRACK) & (rows[:, 6] <= MAX_ERROR_PX)]
 
@@ -183,7 +187,7 @@ def _job(copies: Sequence[Path], masks: Mapping[str, Path], options: PoseOptions
 
 
 def _run(job: Job, advance: Callable[[int, str], None], say: Callable[[str], None]) -> dict[str, Any]:
-    """Raises: ValueError where the process dies, with the last line it wrote."""
+    """Run the COLMAP process, or read its result if an earlier run finished it."""
     if not job.output.is_file():
         program, log = Path(__file__).with_name("colmap_process"), job.folder / "log"
         log.unlink(missing_ok=True)
@@ -206,7 +210,7 @@ def _run(job: Job, advance: Callable[[int, str], None], say: Callable[[str], Non
 def _posed_images(
     model: Mapping[str, Any], photos: Path, masks: Mapping[str, Path], workspace: Path
 ) -> tuple[PosedImages, int]:
-    """The photos, undistorted and set upright, and how many had to be turned."""
+    """Return the photos, undistorted and upright, and the number of photos that were turned."""
     (workspace / "images").mkdir(exist_ok=True)
     if masks:
         (workspace / "masks").mkdir(exist_ok=True)
@@ -244,9 +248,10 @@ def _posed_images(
 
 
 def upright(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Similarity:
-    """upright_from_world: +z up, the support plane at z = 0 where one is clear, the median point above the origin.
+    """Compute upright_from_world: +z is up, the support plane is z = 0, and the median point lies above the origin.
 
-    The median distance of the cameras from the median point becomes 1, since structure from motion has no scale.
+    Without a clear support plane, the median point is the origin. The cameras' median distance from the median point
+    becomes 1, because structure from motion has no scale.
     """
     up = estimate_up(cameras)
     plane = dominant_level_plane(points, up)

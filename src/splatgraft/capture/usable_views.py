@@ -1,9 +1,12 @@
-"""Which photos, masks and views of a capture are of use, and the reason against each of the others.
+"""Selection of the usable photos, masks and views of a capture, with a reason against each of the others.
 
-Photos that do not belong among the others are unreadable, tiny, copies of another, or far more blurred. Blur is
-measured by the fine detail of a photo in relation to its coarse detail, which depends little on what is shown: mean
-square second differences at full size over those at a sixteenth of it, in the direction where this is least, since a
-moving camera blurs in one direction only. Views must be enough, and far enough apart, to reconstruct from.
+- Photos are left out if they are unreadable, tiny, a copy of another, or far more blurred than the others.
+- Masks are left out if they are unreadable, of another shape than the photo, or uniform.
+- Views must be numerous and far enough apart to reconstruct from.
+
+Sharpness is the ratio of fine to coarse detail, which depends little on the subject: mean square second differences at
+full size over those at a sixteenth of it. The direction of the smallest ratio counts, because camera motion blurs in
+one direction only.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,46 +29,48 @@ from splatgraft.formats.captures.masks import PhotoFiles, check_mask
 from splatgraft.runtime.progress import Progress, silent
 
 MIN_VIEWS = 8
-"""Different photos or views that are needed: a closed ring of 8 has a view every 45 degrees, with which each surface is
-seen by three."""
-_MIN_PARALLAX_DEG = 3.0
-"""Angle at which the outermost cameras see a point. At 3 degrees one pixel of error, at a focal length of 1000 px,
-moves a point by 2% of its distance."""
-_POINTS, _CAMERAS = 256, 128
-"""Most points and cameras that are compared, evenly spaced in their order."""
-_MIN_SIDE_PX = 16  # shorter side; smaller pictures hold no window of SSIM (11 px) and no features
+"""Smallest number of different photos or views: in a ring of 8, one every 45 degrees, three see each surface."""
+_MIN_PARALLAX_DEG = 3.0  # smallest parallax: 1 px of error at a focal length of 1000 px is 2% of the distance
+_POINTS, _CAMERAS = 256, 128  # most points and cameras whose parallax is measured, evenly spaced in their order
+_MIN_SIDE_PX = 16  # shorter side; smaller photos hold no window of SSIM (11 px) and no features
 _MEASURED_PX = 800
-"""Longest side at which blur is measured, or the median photo's where that is smaller, so that a photo which is larger
-than the others counts by what is left of it when it is as small."""
+"""Longest side at which sharpness is measured, or the median photo's if that is smaller: larger photos are compared at
+the size of the others."""
 _BLUR_OCTAVES = 1.5
-"""Fine detail below the median, as a power of two, of a blurred photo. In four captures (three photographed, one
-rendered) the softest photo lies 0.4 to 0.8 below; 9 px of motion blur or a Gaussian blur of 2 px take off 1.5 to 3,
-mostly 2.4."""
-_BLUR_DEVIATIONS = 4.0
-"""Robust standard deviations (1.4826 median absolute deviations) below the median, at least, of a blurred photo."""
-_COARSE_HALVINGS = 4
-"""A blur that is wide enough to take coarse detail as well must not pass for sharp: a sixteenth holds up to 16 px."""
-_COARSE_PX = 8  # least side at that size for its detail to mean anything
+"""Smallest difference of a blurred photo's sharpness from the median, octaves. In four captures (three photographed,
+one rendered) the softest photo lies 0.4 to 0.8 below the median. Motion blur of 9 px or a Gaussian blur of 2 px costs
+1.5 to 3, mostly 2.4."""
+_BLUR_DEVIATIONS = 4.0  # the same in robust standard deviations (1.4826 median absolute deviations)
+_COARSE_HALVINGS = 4  # to a sixteenth, whose detail survives blurs of up to 16 px; else a wide blur would pass
+_COARSE_PX = 8  # smallest side at that size for a meaningful measurement
 _THUMBNAIL_PX = 64
 _COPY_LEVELS = 4.0
-"""Largest difference between two thumbnails that are of one picture, grey levels of 255: that of a JPEG saved again;
-another viewpoint moves edges by much more."""
+"""Largest grey level difference (of 255) between thumbnails of the same picture: that of a JPEG saved again. Another
+viewpoint moves edges by much more."""
 
 
 @dataclass(frozen=True)
 class _Photo:
     path: Path
-    log_detail: float
+    sharpness: float
+    """Sharpness, octaves (see `log_sharpness`)."""
     thumbnail: np.ndarray
-    """Grey levels, float32."""
+    """Grey levels of the reduced photo, float32."""
 
 
 def usable_photos(
     photos: Sequence[Path], name: str, *, keep_odd: bool = False, progress: Progress = silent
 ) -> tuple[list[Path], tuple[LeftOut, ...]]:
-    """The photos of the capture `name` without poses that are worth a pose, at least 8, and the others.
+    """Separate the photos of a capture without poses into usable and odd ones.
 
-    With `keep_odd` copies and blurred photos stay; unreadable ones never do.
+    Args:
+        photos: Files of the photos.
+        name: Name of the capture, for messages.
+        keep_odd: Whether copies and blurred photos stay; unreadable ones never do.
+        progress: Called with photos done, photos in all and a short text.
+
+    Raises:
+        ValueError: Fewer than 8 photos are usable.
     """
     odd = find_odd_photos(photos, keep_odd=keep_odd, progress=progress)
     out = {one.name for one in odd}
@@ -81,7 +86,7 @@ def usable_photos(
 
 
 def usable_masks(photos: PhotoFiles) -> tuple[PhotoFiles, tuple[LeftOut, ...]]:
-    """The photos without masks that are unreadable, of another shape, or black or white all over; and these."""
+    """Remove masks that are unreadable, of another shape, or uniform; return the photos and the removed masks."""
 
     def reason_against(photo: Path, mask: Path) -> str:
         check_mask(mask, stored_size(photo))
@@ -92,9 +97,9 @@ def usable_masks(photos: PhotoFiles) -> tuple[PhotoFiles, tuple[LeftOut, ...]]:
 
 
 def usable_views(posed: PosedImages, *, keep_odd: bool = False, progress: Progress = silent) -> PosedImages:
-    """The posed views without odd photos, and without masks that are black or white all over; added to `left_out`.
+    """Remove odd photos and uniform masks from posed views, and add them to `left_out`.
 
-    With `keep_odd` copies and blurred photos stay; unreadable ones never do.
+    With `keep_odd`, copies and blurred photos stay; unreadable ones never do.
     """
     kept = _without(posed, find_odd_photos(posed.image_paths, keep_odd=keep_odd, progress=progress))
     names = kept.cameras.names
@@ -103,7 +108,7 @@ def usable_views(posed: PosedImages, *, keep_odd: bool = False, progress: Progre
 
 
 def readable_views(posed: PosedImages, *, progress: Progress = silent) -> PosedImages:
-    """The posed views whose files can be decoded to their end; the others are added to `left_out`."""
+    """Remove views whose files cannot be decoded to their end, and add them to `left_out`."""
     return _without(posed, find_odd_photos(posed.image_paths, keep_odd=True, progress=progress))
 
 
@@ -119,7 +124,7 @@ def _without_useless(
     names: Sequence[str],
     reason_against: Callable[[Path, Path], str],
 ) -> tuple[tuple[Path | None, ...], tuple[LeftOut, ...]]:
-    """The masks that are of use, none where there are none, and the others with their reasons, or ValueErrors'."""
+    """Remove the masks against which `reason_against` returns or raises a reason; no masks if none is left."""
     kept, left_out = list(masks), []
     for index, (photo, mask) in enumerate(zip(photos, masks, strict=bool(masks))):
         if mask is None or mask == photo:
@@ -135,7 +140,7 @@ def _without_useless(
 
 
 def _emptiness(mask: Path) -> str:
-    """Why a mask that is black or white all over tells nothing; empty where it is neither."""
+    """Return the reason against a mask that is black or white all over; empty for other masks."""
     solid = read_mask(mask) >= 0.5
     if bool(solid.any()) and not bool(solid.all()):
         return ""
@@ -145,9 +150,10 @@ def _emptiness(mask: Path) -> str:
 def find_odd_photos(
     photos: Sequence[Path], *, keep_odd: bool = False, progress: Progress = silent
 ) -> tuple[LeftOut, ...]:
-    """The photos to leave out, by full path in their order, each with the reason; the first of several copies stays.
+    """Find the photos to leave out, by full path in their order, each with a reason.
 
-    With `keep_odd` only those that cannot be decoded to their end or are too small.
+    The first of several copies is not odd. With `keep_odd`, only photos that cannot be decoded to their end or are too
+    small are odd.
     """
     examined: list[_Photo] = []
     reasons: dict[Path, str] = {}
@@ -165,7 +171,7 @@ def find_odd_photos(
 
 
 def _median_side(photos: Sequence[Path]) -> int:
-    """Median longest side of the photos whose header can be read, pixels."""
+    """Compute the median longest side of the photos with a readable header, pixels."""
     sides: list[int] = []
     for photo in photos:
         with suppress(ValueError):
@@ -184,25 +190,32 @@ def _examine(path: Path, measured_px: int) -> _Photo:
     if factor < 1:
         grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     thumbnail = cv2.resize(grey, (_THUMBNAIL_PX, _THUMBNAIL_PX), interpolation=cv2.INTER_AREA)
-    return _Photo(path, _log_detail(grey), thumbnail)
+    return _Photo(path, log_sharpness(grey), thumbnail)
 
 
-def _log_detail(grey: np.ndarray) -> float:
-    """Half the binary logarithm of fine over coarse mean square second differences; nan where these are too few."""
+def log_sharpness(grey: Float[np.ndarray, "h w"]) -> float:
+    """Compute the sharpness of a photo, octaves: log2 of the RMS ratio of fine to coarse second differences.
+
+    Args:
+        grey: Grey levels from 0 to 255, float32.
+
+    Returns:
+        Sharpness in the least sharp of four directions; nan if the photo is too small or plain.
+    """
     coarse = grey
     for _ in range(_COARSE_HALVINGS):
         coarse = cv2.pyrDown(coarse)
     if min(coarse.shape) < _COARSE_PX:
         return float("nan")
     fine_squares, coarse_squares = _second_differences(grey), _second_differences(coarse)
-    # a tenth of a grey level is less than rounding: nothing to compare
+    # a tenth of a grey level is below rounding
     if coarse_squares.min() < 0.01:
         return float("nan")
     return 0.5 * float(np.log2((fine_squares + 1e-6) / coarse_squares).min())
 
 
 def _second_differences(grey: np.ndarray) -> np.ndarray:
-    """Mean squares along both axes and both diagonals, per pixel of length."""
+    """Compute mean squares of second differences along both axes and both diagonals, per pixel of length."""
     middle = grey[1:-1, 1:-1]
     across = (
         grey[1:-1, 2:] + grey[1:-1, :-2],
@@ -215,7 +228,7 @@ def _second_differences(grey: np.ndarray) -> np.ndarray:
 
 
 def _copies(photos: Sequence[_Photo]) -> tuple[list[_Photo], dict[Path, str]]:
-    """The photos of different pictures, and the reason against each copy."""
+    """Return the photos without copies, and the reason against each copy."""
     kept: list[_Photo] = []
     reasons: dict[Path, str] = {}
     for photo in photos:
@@ -228,8 +241,8 @@ def _copies(photos: Sequence[_Photo]) -> tuple[list[_Photo], dict[Path, str]]:
 
 
 def _blurred(photos: Sequence[_Photo]) -> dict[Path, str]:
-    """The reason against each blurred photo."""
-    known = np.array([photo.log_detail for photo in photos if np.isfinite(photo.log_detail)])
+    """Return the reason against each blurred photo."""
+    known = np.array([photo.sharpness for photo in photos if np.isfinite(photo.sharpness)])
     if not len(known):
         return {}
     middle = float(np.median(known))
@@ -237,14 +250,14 @@ def _blurred(photos: Sequence[_Photo]) -> dict[Path, str]:
     limit = middle - max(_BLUR_OCTAVES, _BLUR_DEVIATIONS * spread)
     return {
         photo.path: f"{photo.path}: expected about as much fine detail as in the other photos, "
-        f"found {2 ** (photo.log_detail - middle):.0%} of the median: it is blurred"
+        f"found {2 ** (photo.sharpness - middle):.0%} of the median: it is blurred"
         for photo in photos
-        if photo.log_detail < limit
+        if photo.sharpness < limit
     }
 
 
 def require_coverage(capture: PosedImages, name: str) -> None:
-    """Refuse views of the capture `name` that are too few or too close together; a good one has ten times as much."""
+    """Raise a ValueError if the views of the capture `name` are too few or too close together."""
     needed = (
         f"expected at least {MIN_VIEWS} posed views with a parallax of {_MIN_PARALLAX_DEG:g} degrees or more "
         f"(40 or more views from all around are usual)"
@@ -260,9 +273,12 @@ def require_coverage(capture: PosedImages, name: str) -> None:
 
 
 def median_parallax_deg(cameras: Cameras, points: Float[Tensor, "m 3"]) -> float | None:
-    """The angle between the outermost cameras that see a point, in the median over points; None where unknown.
+    """Compute the median, over points, of the widest angle between two cameras that see the point, degrees.
 
-    Without points that two cameras see, the focus point of the cameras serves, where they have one.
+    If no point is seen by two cameras, the focus point of the cameras replaces the points.
+
+    Returns:
+        The angle; 0 if all cameras are in one place, None if the cameras have no focus point either.
     """
     some = cameras.spread(_CAMERAS)
     centers = some.centers.double()
@@ -282,7 +298,7 @@ def median_parallax_deg(cameras: Cameras, points: Float[Tensor, "m 3"]) -> float
 
 
 def _seen(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Tensor:
-    """Which camera has which point in its image, (v, m)."""
+    """Test which camera has which point in its image, (v, m)."""
     seen = []
     for camera in cameras:
         pixels, depth = camera.project(points)
@@ -291,7 +307,7 @@ def _seen(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Tensor:
 
 
 def _widest_deg(centers: Float[Tensor, "v 3"], points: Float[Tensor, "m 3"], seen: Tensor) -> Float[Tensor, "m"]:
-    """The widest angle at each point between two cameras that see it, degrees."""
+    """Compute the widest angle at each point between two cameras that see it, degrees."""
     rays = torch.nn.functional.normalize(centers[:, None] - points, dim=-1)
     cosines = torch.einsum("vmi,wmi->mvw", rays, rays)
     both = seen.T[:, :, None] & seen.T[:, None, :]

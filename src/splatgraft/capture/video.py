@@ -1,8 +1,11 @@
-"""Frames of a video at equal steps of motion, each the sharpest of its stretch.
+"""Selection of video frames: the sharpest frame of each of many stretches of equal image motion.
 
-How far the picture has moved at each frame, and where the video is cut, is found by tracking corners (Lucas-Kanade)
-from a reference frame, which is renewed after a known displacement: jitter and noise of a camera that stands still do
-not add up. Lengths are over the picture's longest side; constants are set by hand.
+1. Image motion and cuts are found by tracking corners (Lucas-Kanade) from a reference frame. The reference changes only
+   after a certain displacement, so the jitter and noise of a camera at rest do not accumulate.
+2. Each shot is divided into stretches of equal motion.
+3. The sharpest frame of each stretch is written.
+
+Motion is measured over the longest side of the picture. Constants are set by hand.
 """
 
 import itertools
@@ -20,28 +23,26 @@ from splatgraft.runtime.note import Note
 from splatgraft.runtime.progress import Progress, silent
 
 VIDEO_FRAMES = 120
-"""Frames taken of a video, where it has as many and different views."""
+"""Default number of frames taken from a video; a video with less motion gives fewer."""
 _MIN_FRAMES = 3
-_SHARPNESS_PX = 480  # longest side at which sharpness is measured, so that it does not depend on the resolution
-_MISSING_SHARE = 0.02
-"""Share of the announced frames that may be missing before the file counts as cut off; containers count roughly."""
+_SHARPNESS_PX = 480  # longest side at which sharpness is measured, independent of the video's resolution
+_MISSING_SHARE = 0.02  # largest share of announced frames that may be missing; containers count roughly
 _TRACKED_PX = 320  # longest side at which corners are tracked
-_CORNERS = 200  # corners that are tracked
-_MIN_CORNERS = 8  # corners below which a frame has nothing to track, such as a black one
-_RETURNED_PX = 1.0  # largest error of a corner tracked forth and back
-_RENEWED_AFTER = 0.05  # displacement after which another reference frame is taken
-_RENEWED_BELOW = 0.6  # share of corners still tracked below which another is taken
-_CUT_BELOW = 0.3
-"""Share of corners tracked from the frame before below which it is another shot; blurred motion has 0.6."""
-_MIN_STEP = 0.02  # motion between two frames, at least: 13 pixels of 640, from which structure from motion gains depth
-_STRETCH_MARGIN = 0.2  # share of a stretch at either end that is avoided, so that neighbours do not meet there
-_WIDE_STEP = 0.15  # motion between frames above which they may overlap too little
-_STANDING_S = 1.0  # shortest time of standing still that is mentioned, seconds
-_NAMED_CUTS = 5
+_CORNERS = 200  # most corners that are tracked
+_MIN_CORNERS = 8  # fewest corners for tracking; a black frame has fewer
+_RETURNED_PX = 1.0  # largest error of a corner tracked forward and back, pixels
+_RENEWED_AFTER = 0.05  # displacement after which the reference frame changes
+_RENEWED_BELOW = 0.6  # share of corners still tracked, below which the reference frame changes
+_CUT_BELOW = 0.3  # share of corners tracked from the frame before, below which a cut lies between; blur leaves 0.6
+_MIN_STEP = 0.02  # smallest motion between chosen frames, 13 pixels of 640: enough for depth in structure from motion
+_STRETCH_MARGIN = 0.2  # share avoided at either end of a stretch, so that chosen neighbours are not adjacent frames
+_WIDE_STEP = 0.15  # motion between chosen frames above which they may overlap too little
+_STANDING_S = 1.0  # shortest pause that is reported, seconds
+_NAMED_CUTS = 5  # most cuts that a note lists
 
 
 def describe_video(video: Path) -> str:
-    """Duration and size of a video, by its header and its first frame."""
+    """Describe duration and size of a video by its header and its first frame."""
     with _opened(video) as capture:
         is_read, frame = capture.read()
         frames, rate = _announced(capture), capture.get(cv2.CAP_PROP_FPS)
@@ -55,19 +56,22 @@ def describe_video(video: Path) -> str:
 def extract_frames(
     video: Path, folder: Path, *, count: int = VIDEO_FRAMES, progress: Progress = silent
 ) -> tuple[list[Path], tuple[Note, ...]]:
-    """Write the sharpest frame of each of at most `count` stretches of equal motion of `video`, as PNG.
+    """Divide a video into stretches of equal motion and write the sharpest frame of each as PNG.
 
-    Motion is the median displacement of tracked corners, so that a camera that stands still gives one frame however
-    long it does. Sharpness is the variance of the Laplacian of the frame, reduced to 480 px; motion blur lowers it.
+    Motion is the median displacement of tracked corners, so a pause of any length gives one frame. Sharpness is the
+    variance of the Laplacian of the frame, reduced to 480 px; motion blur lowers it.
 
     Args:
         video: Any file that OpenCV can read.
-        folder: Made where it does not exist.
-        count: Frames to write; fewer if the picture moves less than 2% of its longest side between them.
+        folder: Folder of the frames, made if missing.
+        count: Most frames to write; fewer if the picture would move less than 2% of its longest side between them.
         progress: Called every 25 frames, in two passes.
 
     Returns:
-        The files, in order of time, and how the frames were chosen: pauses, cuts, a truncated file.
+        The files in order of time, and notes on the choice: pauses, cuts, a truncated file.
+
+    Raises:
+        ValueError: The video cannot be read, or has fewer than 3 different views.
     """
     with _opened(video) as capture:
         announced, rate = _announced(capture), capture.get(cv2.CAP_PROP_FPS)
@@ -93,12 +97,12 @@ def extract_frames(
             if index in wanted:
                 paths.append(folder / f"frame_{index:06d}.png")
                 if not cv2.imwrite(str(paths[-1]), frame):
-                    raise ValueError(f"{paths[-1]}: expected to write a frame here, found no way to")
+                    raise ValueError(f"{paths[-1]}: expected to write a frame, found that OpenCV could not")
     return paths, tuple(notes)
 
 
 def grey_frames(video: Path, count: int, longest_px: int) -> list[UInt8[np.ndarray, "_ _"]]:
-    """Luma of at most `count` frames spread evenly over a video, with a longest side of at most `longest_px`."""
+    """Read the luma of at most `count` frames, evenly spaced in a video, reduced to `longest_px`."""
     found: list[np.ndarray] = []
     with _opened(video) as capture:
         total = _announced(capture)
@@ -106,7 +110,7 @@ def grey_frames(video: Path, count: int, longest_px: int) -> list[UInt8[np.ndarr
             capture.set(cv2.CAP_PROP_POS_FRAMES, k * total // min(count, total))
             is_read, frame = capture.read()
             if is_read:
-                # grey first: `_reduced` of colours rounds otherwise
+                # grey before reduction: the other order rounds differently
                 found.append(_reduced(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), longest_px))
     if len(found) < _MIN_FRAMES:
         raise ValueError(f"{video}: expected a video of at least {_MIN_FRAMES} frames, found {len(found)}")
@@ -114,8 +118,8 @@ def grey_frames(video: Path, count: int, longest_px: int) -> list[UInt8[np.ndarr
 
 
 def motion(frames: Iterable[np.ndarray]) -> Iterator[tuple[float, bool]]:
-    """For each frame, the path of the picture so far, over its longest side, and whether a cut comes before it."""
-    # position of the reference frame on the path, and of this frame
+    """Yield, for each frame, the motion so far over the longest side, and whether a cut precedes the frame."""
+    # motion up to the reference frame, and up to this frame
     travelled = here = 0.0
     reference = before = corners = None
     for frame in frames:
@@ -126,7 +130,7 @@ def motion(frames: Iterable[np.ndarray]) -> Iterator[tuple[float, bool]]:
             continue
         moved, share = _moved(reference, corners, small)
         if share < _RENEWED_BELOW:
-            # too much has left the picture: go on from the frame before
+            # too many corners have left the picture: track from the frame before
             travelled, reference, corners = here, before, _corners(before)
             moved, share = _moved(before, corners, small)
         tracked = len(corners) >= _MIN_CORNERS
@@ -145,7 +149,7 @@ def _corners(small: np.ndarray) -> Float[np.ndarray, "n 1 2"]:
 
 
 def _moved(old: np.ndarray, corners: Float[np.ndarray, "n 1 2"], new: np.ndarray) -> tuple[float, float]:
-    """Median displacement of the corners that are found again, and their share."""
+    """Return the median displacement of the corners that are found again, and their share."""
     if len(corners) < _MIN_CORNERS:
         return 0.0, 0.0
     there, seen, _ = cv2.calcOpticalFlowPyrLK(old, new, corners, np.empty_like(corners))
@@ -161,13 +165,16 @@ def _moved(old: np.ndarray, corners: Float[np.ndarray, "n 1 2"], new: np.ndarray
 def choose_frames(
     path: Float[np.ndarray, "n"], sharpness: Float[np.ndarray, "n"], shots: np.ndarray, count: int
 ) -> tuple[list[int], float]:
-    """The sharpest frame of each of at most `count` stretches of equal motion, one more per shot, and their length.
+    """Choose the sharpest frame of each stretch of equal motion.
 
     Args:
         path: Motion up to each frame, over the picture's longest side.
         sharpness: Sharpness of each frame, any unit.
-        shots: Number of the shot of each frame, from 0 up; shots are not mixed.
-        count: Largest number of frames.
+        shots: Index of the shot of each frame, from 0; a stretch lies in one shot.
+        count: Largest number of frames; each shot may add one.
+
+    Returns:
+        Indices of the chosen frames, and the motion in a stretch.
     """
     total = sum(float(np.ptp(path[shots == shot])) for shot in np.unique(shots))
     step = max(total / count, _MIN_STEP)
@@ -175,7 +182,7 @@ def choose_frames(
     for shot in np.unique(shots):
         frames = np.flatnonzero(shots == shot)
         along = (path[frames] - path[frames].min()) / step
-        # the last frame ends the last stretch, and is none of its own
+        # the last frame belongs to the last stretch
         last = max(0, int(np.ceil(along.max() - 1e-6)) - 1)
         stretches = np.minimum(np.floor(along), last)
         for stretch in np.unique(stretches):
@@ -188,23 +195,23 @@ def choose_frames(
 
 def _notes(path: np.ndarray, cuts: np.ndarray, rate: float, chosen: int, step: float) -> list[Note]:
     said = [
-        f"{chosen} of {len(path)} frames, each the sharpest of a stretch in which the picture moves by {step:.1%} of "
+        f"{chosen} of {len(path)} frames were taken, each the sharpest while the picture moves by {step:.1%} of "
         f"its longest side"
     ]
     if step > _WIDE_STEP:
         said[0] += ": they may overlap too little; film more slowly, or give a shorter video"
-    # a stretch of one second in which the picture moves less than a tenth of a step
+    # still: in one second the picture moves less than a tenth of a step
     window = max(1, round(_STANDING_S * rate))
     if len(path) > window:
         still = np.abs(path[window:] - path[:-window]) < 0.1 * step
         seconds = float(still.sum()) / rate
         if seconds > 0:
-            said.append(f"the camera stands still for about {seconds + _STANDING_S:.0f} s, which give no more frames")
+            said.append(f"the camera stands still for about {seconds + _STANDING_S:.0f} s, which adds no frames")
     if len(cuts):
         times = ", ".join(f"{cut / rate:.1f} s" for cut in cuts[:_NAMED_CUTS])
         more = ", ..." if len(cuts) > _NAMED_CUTS else ""
         said.append(
-            f"the video is cut at {times}{more}: frames before and after belong together only if they show one place"
+            f"the video is cut at {times}{more}: frames before and after fit together only if they show one place"
         )
     return [Note(text) for text in said]
 

@@ -1,8 +1,11 @@
-"""Virtual cameras for a trained scene that comes without images: its dense part, its up direction, and camera poses.
+"""Virtual cameras for a trained scene without images.
 
-The dense part is found by trimmed means, up as the normal of the largest plane (RANSAC), the poses on rings around the
-dense part or within it, with occluded positions removed by rendering the scene. All constants are set by hand; lengths
-are over the radius of the dense part.
+1. The centre and radius of the scene's dense part are found by trimmed means.
+2. Up is the normal of the largest plane in the dense part (RANSAC).
+3. Cameras are placed on rings around the dense part, or within it.
+4. Positions with an occluded view are removed by rendering the scene.
+
+All constants are set by hand. Lengths are over the radius of the dense part.
 """
 
 import math
@@ -24,57 +27,53 @@ from splatgraft.rendering import render
 from splatgraft.runtime.note import Note
 from splatgraft.runtime.progress import Progress, silent
 
-_HALF_FOV = math.radians(30)  # half the horizontal field of view of the pictures, radians
-_MIN_VIEWS = 8  # number of poses that are kept even where they are occluded
+_HALF_FOV = math.radians(30)  # half the horizontal field of view, radians
+_MIN_VIEWS = 8  # smallest number of views; the least occluded ones are added if too few are free
 
-# what is solid, and which plane is a floor
-_MIN_OPACITY = 0.3  # opacity above which a Gaussian counts as solid
-_MAX_SCALE = 20.0  # scale over the median one from which a Gaussian counts as backdrop
-_MAX_POINTS, _MIN_POINTS = 20_000, 20
-"""Solid Gaussians that are used, and that are needed."""
-_TRIM_ROUNDS = 10  # means of the nearer half of the points, each around the one before
-_PLANE_POINTS = 4000  # points that planes are fitted to, about the dense part within twice its radius
+# solid Gaussians and floor planes
+_MIN_OPACITY = 0.3  # smallest opacity of a solid Gaussian
+_MAX_SCALE = 20.0  # largest scale of a solid Gaussian, over the median; larger ones are backdrop
+_MAX_POINTS, _MIN_POINTS = 20_000, 20  # most solid Gaussians that are used, and fewest
+_TRIM_ROUNDS = 10  # each takes the mean of the half of the points nearest to the mean before
+_PLANE_POINTS = 4000  # points to which planes are fitted, within twice the dense part's radius
 _TRIALS = 1000  # random planes
-_THICKNESS = 0.02  # largest distance of a point that counts as on a plane
-_ALIGNED_COS = math.cos(math.radians(25.0))
-"""Cosine of the angle to a customary up direction (y or z of the file) below which a plane is taken for a floor."""
-_UNALIGNED_WEIGHT = 0.6  # factor on the points of other planes: walls are as large as floors
-_MIN_SHARE = 0.1  # least share of the points on the plane
-_SIDE_RATIO = 3.0  # points on one side of the plane over those on the other, above which the first side is up
-_HOLLOW_SHARE = 0.08
-"""Share of points within half the radius below which a scene is hollow: a solid ball has 0.06, a table more."""
+_THICKNESS = 0.02  # largest distance of a plane's points from it
+_ALIGNED_COS = math.cos(math.radians(25.0))  # smallest cosine between a floor's normal and a usual up (y or z axis)
+_UNALIGNED_WEIGHT = 0.6  # factor on the points of other planes, because walls are as large as floors
+_MIN_SHARE = 0.1  # smallest share of points on the plane
+_SIDE_RATIO = 3.0  # ratio of points on the two sides of the plane above which the fuller side is up
+_HOLLOW_SHARE = 0.08  # share of points within half the radius below which a scene is hollow; a table has more
 
-# candidate positions, and what occludes them
-_DISTANCES = (2.4, 1.7, 3.4, 1.2)
-"""Distances of eyes around the dense part from its centre, the best first: at 2.4 it fills the picture."""
+# candidate positions and their occlusion
+_DISTANCES = (2.4, 1.7, 3.4, 1.2)  # from the centre, in order of preference; at 2.4 the dense part fills the picture
 _ELEVATIONS_DEG = (20.0, 42.0)  # elevations of the rings around the dense part
-_CLEAR = 1.1  # distance from the centre towards the eye beyond which anything occludes the dense part
-_CLEAR_AT_EDGES = 0.35  # distance from the eye, over that of the centre, below which anything occludes the picture
-_HEIGHTS = (0.2, 0.6, 0.0)  # heights of eyes within the scene above the centre, the best first
+_CLEAR = 1.1  # distance from the centre; anything nearer to the camera occludes the dense part
+_CLEAR_AT_EDGES = 0.35  # distance from the camera, over that of the centre; anything nearer occludes the picture
+_HEIGHTS = (0.2, 0.6, 0.0)  # heights of cameras within the scene above the centre, in order of preference
 _ELEVATIONS_WITHIN_DEG = (0.0, -25.0)  # elevations of views out of the scene
-_STEP_BACK = 0.3  # horizontal distance of eyes within the scene from the centre, against the view
+_STEP_BACK = 0.3  # horizontal distance of cameras within the scene behind the centre
 _CLEAR_WITHIN, _CLEAR_AT_EDGES_WITHIN = 0.3, 0.15
-"""Distance from an eye within the scene below which anything occludes the middle of the picture, and the picture."""
-_MIN_SEEN_WITHIN = 0.5  # least mean opacity of a picture from within
-_OCCLUDED = 0.1  # occluded share from which a position is not taken
-_MIDDLE_WEIGHT = 0.3  # factor on the occluded share of the picture's middle against that of the whole picture
+"""Distances from a camera within the scene; anything nearer occludes the middle of the picture, and the picture."""
+_MIN_SEEN_WITHIN = 0.5  # smallest mean opacity of a picture from within
+_OCCLUDED = 0.1  # occluded share from which a position is rejected
+_MIDDLE_WEIGHT = 0.3  # weight of the occluded share of the middle against that of the whole picture
 
 
 @dataclass(frozen=True)
 class VirtualCameraOptions:
-    """Pictures to render of a trained scene that comes without photographs."""
+    """Options of the pictures of a trained scene without photographs."""
 
     views: int = 36
-    """Number of pictures to render of a trained scene; fewer where the view is blocked."""
+    """Number of pictures to render of a trained scene; occluded views are left out."""
     look: Literal["around", "within"] = "around"
-    """Whether a trained scene is seen from around its dense part, or outwards from its middle, as in a room."""
+    """Whether a trained scene is seen from around its dense part, or from its middle outwards, as a room is."""
     picture_width: int = 640
     """Width of these pictures, pixels; their height is three quarters of it."""
     up: tuple[float, float, float] | None = None
-    """Up direction of a trained scene; found from its largest level surface where not given."""
+    """Up direction of a trained scene; by default the normal of its largest level surface."""
 
     def __post_init__(self) -> None:
-        """Raises: ValueError where there would be too few views, or up has no length."""
+        """Raise a ValueError if there are too few views, pictures are too small, or up has no length."""
         if self.views < _MIN_VIEWS:
             raise ValueError(f"--views: expected at least {_MIN_VIEWS}, found {self.views}")
         if self.picture_width < 16:
@@ -85,16 +84,16 @@ class VirtualCameraOptions:
 
 @dataclass(frozen=True)
 class _Position:
-    """An eye, the point it looks at, and what occludes it."""
+    """A candidate camera position with the limits of its occlusion test."""
 
     eye: Float[Tensor, "3"]
     target: Float[Tensor, "3"]
     clear: float
-    """Depth below which anything in the middle of the picture occludes it, world units."""
+    """Depth below which a surface in the middle of the picture occludes it, world units."""
     clear_at_edges: float
-    """The same for the whole picture."""
+    """Depth below which a surface anywhere in the picture occludes it, world units."""
     min_seen: float
-    """Least mean opacity of the picture, in [0, 1]."""
+    """Smallest mean opacity of the picture, in [0, 1]."""
 
 
 def place_virtual_cameras(
@@ -104,12 +103,19 @@ def place_virtual_cameras(
     stated_up: tuple[float, float, float] | None = None,
     progress: Progress = silent,
 ) -> tuple[PosedImages, tuple[Note, ...]]:
-    """Place rings of cameras around the scene's dense part or within it, without those whose view is blocked.
+    """Place rings of cameras around the scene's dense part or within it, and leave out occluded views.
 
-    The up direction that the scene's file states counts where `options` have none.
+    Args:
+        scene: Trained scene.
+        options: Number and direction of the views, size of the pictures, up.
+        stated_up: Up direction in the scene's file, used if `options` have none.
+        progress: Called with views done, views in all and a short text.
 
     Returns:
-        A capture whose pictures are not made yet, with the centres of solid Gaussians as points, and what was assumed.
+        A capture without pictures, with the centres of solid Gaussians as points, and notes on the assumptions.
+
+    Raises:
+        ValueError: The scene has fewer than 20 solid Gaussians.
     """
     solid = _solid(scene)
     centre, radius = dense_part(solid.means)
@@ -118,35 +124,33 @@ def place_virtual_cameras(
         up, reason, is_sure = estimate_scene_up(solid.means, centre, radius)
     else:
         up, is_sure = torch.nn.functional.normalize(torch.tensor(given), dim=0), True
-        reason = "as given" if options.up else "as the file's header states; another is named by --up"
+        reason = "as given" if options.up else "stated in the file's header; --up overrides it"
     poses, dropped = _unoccluded_poses(scene, _positions(options, centre, radius, up), up, progress)
     width = options.picture_width
     focal = 0.5 * width / math.tan(_HALF_FOV)
     cameras = pinhole(poses, focal, width=width, height=width * 3 // 4, prefix="look")
     axis = int(up.abs().argmax())
-    along = f", thus {'xyz'[axis]} {'up' if up[axis] > 0 else 'down'}" if abs(float(up[axis])) >= _ALIGNED_COS else ""
-    text = f"up is taken to be {_shown(up)}{along}: {reason}"
-    upside_down = (
-        f"Where the picture is upside down or on its side, give the scene's up (up = [{_numbers(-up)}] turns it over)"
-    )
+    along = f", so {'xyz'[axis]} is {'up' if up[axis] > 0 else 'down'}" if abs(float(up[axis])) >= _ALIGNED_COS else ""
+    text = f"the up direction is {_shown(up)}{along}: {reason}"
+    upside_down = f"If the scene is upside down or on its side, set up (up = [{_numbers(-up)}] turns it over)"
     report = [
         Note(
-            f"a scene without photographs: {len(cameras)} pictures are made of it, from {options.look} {_shown(centre)}"
+            f"the scene has no photographs: {len(cameras)} pictures are rendered from {options.look} {_shown(centre)}"
         ),
-        Note(text) if is_sure else Note(f"{text}. The picture shows it so.", "warning", upside_down),
+        Note(text) if is_sure else Note(f"{text}. The picture shows this orientation.", "warning", upside_down),
     ]
     if dropped:
-        report.append(Note(f"{dropped} of {options.views} views were left out: something stands in their way"))
+        report.append(Note(f"{dropped} of {options.views} views were left out because something occludes them"))
     inner = float(((solid.means - centre).norm(dim=1) < 0.5 * radius).float().mean())
     if options.look == "around" and inner < _HOLLOW_SHARE:
-        remedy = "Where it was seen from within, as a room from its middle, say look = within"
-        report.append(Note("the scene is hollow.", "warning", remedy))
+        remedy = "If it is a room or another place captured from within, set look = within"
+        report.append(Note("the scene is hollow: pictures from outside may show walls from behind.", "warning", remedy))
     colors = rgb_from_dc(solid.sh[:, 0]).clamp(0, 1)
     return PosedImages((), cameras, solid.means, colors), tuple(report)
 
 
 def _solid(scene: Gaussians) -> Gaussians:
-    """Opaque Gaussians that are not backdrop, at most `_MAX_POINTS`, evenly taken."""
+    """Select opaque Gaussians that are not backdrop; of many, at most `_MAX_POINTS`, evenly spaced in their order."""
     largest = scene.scales.amax(1)
     which = ((scene.opacities > _MIN_OPACITY) & (largest < _MAX_SCALE * largest.median())).nonzero()[:, 0]
     if len(which) < _MIN_POINTS:
@@ -155,7 +159,7 @@ def _solid(scene: Gaussians) -> Gaussians:
 
 
 def dense_part(points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "3"], float]:
-    """Centre of the densest half of the points, by iterated trimmed means, and the radius that holds half of them."""
+    """Compute the centre of the densest half of the points by iterated trimmed means, and the radius of that half."""
     centre = points.median(0).values
     for _ in range(_TRIM_ROUNDS):
         distance = (points - centre).norm(dim=1)
@@ -166,16 +170,19 @@ def dense_part(points: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "3"], float]
 def estimate_scene_up(
     points: Float[Tensor, "m 3"], centre: Float[Tensor, "3"], radius: float
 ) -> tuple[Float[Tensor, "3"], str, bool]:
-    """Up direction of a scene: the normal of the largest plane in the dense part, on the side with more points.
+    """Estimate the up direction of a scene: the normal of the largest plane in the dense part.
 
-    The conventions of files decide the sign where the normal is nearly z (+z, since there may be as much below a table
-    as on it), and where both sides are alike (-y, as structure from motion leaves it, or +z). With the reason, and
-    whether the scene itself decided.
+    Up points to the side with more points. The conventions of files decide the sign in two cases: if the normal is
+    nearly z (+z, because there may be as much below a table as on it), and if both sides have similarly many points
+    (+z, or -y as in structure from motion).
+
+    Returns:
+        Unit up direction, its reason for messages, and whether the scene itself decided the sign.
     """
     near = points[(points - centre).norm(dim=1) < 2 * radius]
     near = near[:: max(1, len(near) // _PLANE_POINTS)]
     normals, on_plane = sample_planes(near, _TRIALS, seed=0)
-    # three points on a line span no plane
+    # three points on a line define no plane
     spans = normals.norm(dim=1) > 1e-4 * radius**2
     normals, on_plane = torch.nn.functional.normalize(normals[spans], dim=1), on_plane[spans]
     heights = normals @ near.T - (normals * on_plane).sum(1)[:, None]
@@ -184,7 +191,7 @@ def estimate_scene_up(
     customary = normals[:, 1:].abs().amax(1) > _ALIGNED_COS
     best = int((counts * torch.where(customary, 1.0, _UNALIGNED_WEIGHT)).argmax())
     if counts[best] < _MIN_SHARE * len(near):
-        return torch.tensor([0.0, -1.0, 0.0]), "no level surface was found, and most files have it so", False
+        return torch.tensor([0.0, -1.0, 0.0]), "no level surface was found, and most files have this up", False
     inliers = near[heights[best].abs() < thickness]
     middle = inliers.mean(0)
     normal = least_squares_normal(inliers - middle).float()
@@ -194,16 +201,19 @@ def estimate_scene_up(
     below = float(((height < -3 * thickness) & (height > -radius) & beside).sum())
     share = f"the normal of a surface that holds {float(counts[best]) / len(near):.0%} of the dense part"
     if abs(float(normal[2])) < _ALIGNED_COS and max(above, below) > _SIDE_RATIO * min(above, below) + 1:
-        return normal if above > below else -normal, f"{share}, on whose one side most things stand", True
-    customary_side = float(normal @ torch.tensor([0.0, -1.0, 1.0])) >= 0
-    return normal if customary_side else -normal, f"{share}; which of its sides is a guess by custom", False
+        return normal if above > below else -normal, f"{share}, on the side with most Gaussians", True
+    usual_side = float(normal @ torch.tensor([0.0, -1.0, 1.0])) >= 0
+    return normal if usual_side else -normal, f"{share}; its side is a guess by the conventions of files", False
 
 
 def _positions(
     options: VirtualCameraOptions, centre: Float[Tensor, "3"], radius: float, up: Float[Tensor, "3"]
 ) -> list[list[_Position]]:
-    """Per view, positions along one direction from the centre that look at it, the best first; or, within the scene,
-    near the centre, from which one looks outwards, on the whole slightly down."""
+    """List the candidate positions of each view, in order of preference.
+
+    Around the scene, they lie along one direction from the centre and look at it. Within the scene, they lie near the
+    centre at several heights and look outwards.
+    """
     out: list[list[_Position]] = []
     around = options.look == "around"
     for direction in _directions(options.views, up, _ELEVATIONS_DEG if around else _ELEVATIONS_WITHIN_DEG):
@@ -224,9 +234,12 @@ def _positions(
 def _unoccluded_poses(
     scene: Gaussians, views: Sequence[Sequence[_Position]], up: Float[Tensor, "3"], progress: Progress
 ) -> tuple[Float[Tensor, "v 4 4"], int]:
-    """Poses at the first position of each view that is not occluded, tested by rendering the scene at 48 x 36 pixels.
+    """Choose the first position of each view that is not occluded, by rendering the scene at 48 x 36 pixels.
 
-    With the number of views without such a position, of which the least occluded are added up to `_MIN_VIEWS`.
+    If fewer than `_MIN_VIEWS` views have one, the least occluded of the others are added.
+
+    Returns:
+        Poses, and the number of views without a free position.
     """
     chosen: list[Tensor] = []
     rejected: list[tuple[float, Tensor]] = []
@@ -246,7 +259,7 @@ def _unoccluded_poses(
 def _pose_and_occlusion(
     scene: Gaussians, position: _Position, up: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "4 4"], float]:
-    """A pose, and the occluded share of its picture."""
+    """Compute the pose at a position and the occluded share of its picture."""
     pose = look_at(position.eye[None], position.target, up)
     small = pinhole(pose, 24 / math.tan(_HALF_FOV), width=48, height=36)
     rendered = render(scene, small, outputs=frozenset({"depth"}))
@@ -259,7 +272,7 @@ def _pose_and_occlusion(
 
 
 def _directions(views: int, up: Float[Tensor, "3"], elevations_deg: tuple[float, ...]) -> Float[Tensor, "v 3"]:
-    """Unit directions from the centre, evenly spaced in azimuth, at the elevations in turn."""
+    """Compute unit directions from the centre, evenly spaced in azimuth, with alternating elevations."""
     x = -perpendicular(up)
     y = torch.linalg.cross(up, x)
     index = torch.arange(views)

@@ -1,4 +1,4 @@
-"""What fits of Gaussians to images share: image losses, and a sparse Adam."""
+"""Fitting of Gaussians to images: optimisation loop, density control, sparse Adam and losses."""
 
 from splatgraft.fitting.photometric import l1_dssim
 

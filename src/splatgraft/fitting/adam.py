@@ -1,7 +1,7 @@
-"""Adam that updates only the Gaussians that a view sees, fused for the CPU.
+"""Sparse Adam: updates only the Gaussians in the current view (Mallick et al. 2024, Taming 3DGS, Sec. 4.4).
 
-Sparse updates follow Taming 3DGS (Mallick et al. 2024, Sec. 4.4). Each Gaussian counts its own steps, so that the bias
-correction (Kingma & Ba 2015, Alg. 1) is right for rarely seen ones and for those added later.
+Each Gaussian counts its own steps, so the bias correction (Kingma & Ba 2015, Alg. 1) is right for Gaussians that are
+rarely seen or were added later. The CPU version is one fused numba kernel.
 """
 
 from dataclasses import dataclass, replace
@@ -17,22 +17,22 @@ from splatgraft.runtime.kernels import kernel, serialized
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
-_PART = 1024
+_PART = 1024  # Gaussians per task of a thread
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Running means of the gradients and of their squares, by field; each shaped as its field."""
+    """Adam's moments by field, each of its field's shape."""
 
     first: dict[str, Tensor]
-    """Mean gradient."""
+    """Running mean of the gradient."""
     second: dict[str, Tensor]
-    """Mean squared gradient."""
+    """Running mean of the squared gradient."""
     steps: Int[Tensor, "n"]
-    """Updates of each Gaussian so far, int32."""
+    """Number of updates of each Gaussian, int32."""
 
     def select(self, which: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "Moments":
-        """The moments of the chosen Gaussians."""
+        """Return the moments of the chosen Gaussians."""
         return Moments(
             {k: v[which] for k, v in self.first.items()},
             {k: v[which] for k, v in self.second.items()},
@@ -40,7 +40,7 @@ class Moments:
         )
 
     def reset(self, which: Int[Tensor, "m"]) -> "Moments":
-        """Copies with the moments and steps of the chosen Gaussians set to zero."""
+        """Return a copy with the moments and steps of the chosen Gaussians set to zero."""
         out = Moments(
             {k: v.clone() for k, v in self.first.items()},
             {k: v.clone() for k, v in self.second.items()},
@@ -51,7 +51,7 @@ class Moments:
         return out
 
     def padded(self, field: str, columns: int) -> "Moments":
-        """Copies with the second axis of one field's moments padded with zeros to `columns`."""
+        """Return a copy with the second axis of one field's moments padded with zeros to `columns`."""
 
         def grow(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
             old = tensors[field]
@@ -63,7 +63,7 @@ class Moments:
 
 
 def no_moments(tensors: dict[str, Tensor], count: int) -> Moments:
-    """Zero moments for tensors of `count` Gaussians."""
+    """Return zero moments for tensors of `count` Gaussians."""
     device = next(iter(tensors.values())).device
     return Moments(
         {k: torch.zeros_like(v) for k, v in tensors.items()},
@@ -80,9 +80,17 @@ def step(
     rates: dict[str, Float[Tensor, "c"]],
     visible: Bool[Tensor, "n"],
 ) -> bool:
-    """Update `values` (n, ..) and `moments` in place where `visible`; a rate for each column, flattened.
+    """Update the visible Gaussians' values and moments in place.
 
-    False where a gradient was not finite; the rows with such gradients stay unchanged.
+    Args:
+        values: Values (n, ..) by field.
+        gradients: Gradients of the loss by field.
+        moments: Moments of the same fields.
+        rates: Learning rate of each flattened column, by field.
+        visible: Which Gaussians are updated.
+
+    Returns:
+        Whether all gradients were finite; rows with other gradients stay unchanged.
     """
     moments.steps[visible] += 1
     update = _step_numba if visible.device.type == "cpu" else _step_torch
@@ -111,7 +119,7 @@ def _step_numba(rows: _Rows, steps: Int[Tensor, "n"], rates: _Rates, visible: Bo
 @kernel(fastmath=_FAST, error_model="numpy")
 @no_type_check
 def bias_corrections(step):
-    """Factors on the first and the second moment after the update number `step`, counted from 1."""
+    """Compute the factors on the first and second moment after update number `step`, counted from 1."""
     one = np.float32(1)
     return (
         one / (one - np.float32(BETA_1) ** np.float32(step)),
@@ -119,11 +127,11 @@ def bias_corrections(step):
     )
 
 
-# divisions follow numpy, since a check for zero would be a branch in the loop
+# divisions follow numpy, because a check for zero would be a branch in the loop
 @kernel(fastmath=_FAST, error_model="numpy")
 @no_type_check
 def update_row(value, gradient, moments, corrections, rate):
-    """Update one Gaussian's row of a field in place; returns 1 and changes nothing where a number is not finite."""
+    """Update one Gaussian's row of a field in place; return 1 and change nothing if a gradient is not finite."""
     (first, second), (correct_1, correct_2) = moments, corrections
     one, b1, b2 = np.float32(1), np.float32(BETA_1), np.float32(BETA_2)
     columns = value.shape[0]
@@ -145,7 +153,7 @@ def update_row(value, gradient, moments, corrections, rate):
 @kernel
 @no_type_check
 def _update_part(value, gradient, moments, part, rate):
-    """Update the rows that `part` = (first, last, steps, visible) names; returns how many have no finite gradient."""
+    """Update the rows of `part` = (first, last, steps, visible); return the number of rows without finite gradients."""
     first, second = moments
     begin, end, steps, visible = part
     bad, counted, corrections = 0, np.int32(0), (np.float32(1), np.float32(1))
@@ -163,7 +171,7 @@ def _update_part(value, gradient, moments, part, rate):
 @kernel(parallel=True)
 @no_type_check
 def _update_rows(values, gradients, moments, counts, rates):
-    """All fields in one launch; `counts` = (steps, visible)."""
+    """Update all fields in one launch; `counts` = (steps, visible)."""
     firsts, seconds = moments
     steps, visible = counts
     n = len(visible)
@@ -176,7 +184,7 @@ def _update_rows(values, gradients, moments, counts, rates):
 
 
 def _step_torch(rows: _Rows, steps: Int[Tensor, "n"], rates: _Rates, visible: Bool[Tensor, "n"]) -> bool:
-    """The same update in torch operations, for any device."""
+    """Do the same update in torch operations, on any device."""
     finite = True
     seen = torch.nonzero(visible).flatten()
     for value, gradient, first, second, rate in zip(*rows, rates, strict=True):

@@ -1,13 +1,15 @@
-"""Density control: where Gaussians are split and removed while a scene is fitted, under a hard budget.
+"""Density control: splits and removes Gaussians during a fit, under a hard budget.
 
-As in Taming 3DGS (Mallick et al. 2024, Sec. 4.2) the number follows a schedule up to the budget, and the Gaussians that
-score highest are the ones to split, so that time and memory are known beforehand; the score is 3DGS's own, the mean
-gradient of the loss by the centre in pixels, or this times the square root of the error that the Gaussian covers: the
-sum over the pixels of its blending weight times the absolute error there (the error of Rota Bulo et al. 2024, Revising
-Densification in Gaussian Splatting). A split is along the longest axis (Deng et al. 2025).
+1. The number of Gaussians follows a schedule up to the budget, so that time and memory are known in advance (Taming
+   3DGS, Mallick et al. 2024, Sec. 4.2).
+2. Gaussians with the highest score are split. The score is that of 3DGS, the mean gradient of the loss by the projected
+   centre. Optionally it is multiplied by the square root of the covered error, the sum over the pixels of blending
+   weight times absolute error (Rota Bulo et al. 2024, Revising Densification in Gaussian Splatting).
+3. A split is along the longest axis (Deng et al. 2025).
+4. Transparent Gaussians are removed.
 
-Chosen by measurement: on a room of 36 views at 352x248, 25k Gaussians and 1000 steps, this reached 27.9 dB held out in
-20 CPU-seconds, relocation and noise as in 3DGS-MCMC (Kheradmand et al. 2024) 27.7 in 22.
+Measured on a room (36 views of 352x248 pixels, 25k Gaussians, 1000 steps): 27.9 dB held out in 20 CPU-seconds.
+Relocation and noise as in 3DGS-MCMC (Kheradmand et al. 2024) gave 27.7 dB in 22.
 """
 
 import math
@@ -22,45 +24,43 @@ from splatgraft.fitting.gaussian_fit import FitState, Step
 from splatgraft.rendering import view_operator
 
 # set by hand where no source is named
-_DEAD_OPACITY = 0.005  # opacity below which a Gaussian is removed (3DGS, Sec. 5).
+_DEAD_OPACITY = 0.005  # opacity below which a Gaussian is removed (3DGS, Sec. 5)
 _SHIFT = 0.5  # distance of the children from the parent's centre, in the parent's longest standard deviation
-_LONG_SCALE = math.sqrt(1 - _SHIFT**2)
-"""Width of a child along the split axis, over the parent's; keeps the variance: shift^2 + long_scale^2 = 1."""
+_LONG_SCALE = math.sqrt(1 - _SHIFT**2)  # width of a child along the split axis, over the parent's; keeps the variance
 _SHORT_SCALE = 0.85  # width of a child across the split axis, over the parent's
 _CHILD_OPACITY = 0.6  # opacity of a child over the parent's
 _MIN_CHILD_OPACITY = 1.2 * _DEAD_OPACITY
 _MAX_SCALE = 0.125
-"""Bound on the standard deviation, over the distance to the nearest camera. A larger one beside a view reaches the
+"""Largest standard deviation, over the distance to the nearest camera. A larger Gaussian beside the view can reach the
 camera's plane, where the affine projection spreads it over the whole picture."""
 
 
 @dataclass(frozen=True)
 class DensityControl:
-    """Schedule of the density control, as a `Control` of the fit."""
+    """Schedule of the density control; `update` is a `Control` of the fit."""
 
     budget: int
-    """Never exceeded."""
+    """Largest number of Gaussians, never exceeded."""
     first_count: int
-    """Number at the start; the allowed number rises linearly from it to the budget."""
+    """Initial number of Gaussians, from which the allowed number rises linearly to the budget."""
     every: int
     """Steps between two densifications."""
     full_at: int
-    """Step at which the budget may be reached."""
+    """Step at which the allowed number reaches the budget."""
     stop: int
-    """Step after which nothing is added or removed."""
+    """Step after which no Gaussian is added or removed."""
     camera_centers: Float[Tensor, "v 3"]
-    """World units; their distance bounds the scale of a Gaussian."""
+    """Camera positions, world units; their distance bounds the scale of a Gaussian."""
     error_every: int = 0
-    """Steps between two measurements of the error that each Gaussian covers; 0 measures none: the score is the gradient
-    alone."""
+    """Steps between two measurements of the covered error; 0 leaves the error out of the score."""
 
     def allowed(self, iteration: int) -> int:
-        """Number of Gaussians allowed after `iteration` steps."""
+        """Compute the number of Gaussians allowed after `iteration` steps."""
         share = min(1.0, iteration / max(self.full_at, 1))
         return min(self.budget, int(self.first_count + max(self.budget - self.first_count, 0) * share))
 
     def update(self, state: FitState, step: Step) -> FitState:
-        """Add the step's gradient to the scores; when due, remove transparent Gaussians and split the highest."""
+        """Add the step's gradient to the scores; when due, remove transparent Gaussians and split high scores."""
         if state.iteration > self.stop:
             state = replace(state, memory={}) if state.memory else state
             return state if state.iteration % self.every else self._limit_scales(state)
@@ -73,8 +73,7 @@ class DensityControl:
         return self._limit_scales(self._densify(state, score, memory["seen"] > 0))
 
     def _with_step(self, state: FitState, step: Step) -> dict[str, Tensor]:
-        """Sums per Gaussian since the last densification, with those of the step: of gradients and of errors covered,
-        and how often each was measured."""
+        """Add the step to the sums since the last densification: gradients, covered errors, and their counts."""
         none = torch.zeros_like(state.gaussians.opacity_logits)
         names = ("score", "seen", "error", "error_seen") if self.error_every else ("score", "seen")
         memory = {name: state.memory.get(name, none) for name in names}
@@ -102,7 +101,7 @@ class DensityControl:
         )
 
     def _limit_scales(self, state: FitState) -> FitState:
-        """Scales bounded by a share of the distance to the nearest camera."""
+        """Bound the scales by a share of the distance to the nearest camera."""
         means = state.gaussians.means
         nearest = torch.full_like(means[:, 0], torch.inf)
         for center in self.camera_centers:
@@ -113,7 +112,7 @@ class DensityControl:
 
 
 def split(parents: Gaussians) -> Gaussians:
-    """Two children of each parent, side by side along its longest axis: first one of each, then the other."""
+    """Split each parent into two children along its longest axis; all first children precede all second ones."""
     rows = torch.arange(parents.count, device=parents.device)
     axis = parents.log_scales.argmax(1)
     shift = _SHIFT * parents.scales[rows, axis, None] * parents.rotations[rows, :, axis]
@@ -125,9 +124,9 @@ def split(parents: Gaussians) -> Gaussians:
 
 
 def _gradient_in_pixels(gaussians: Gaussians, step: Step) -> Float[Tensor, "n"]:
-    """Length of the loss gradient by the projected centre, in units of half the image (3DGS's densification score).
+    """Compute the gradient norm by the projected centre, in units of half the image (3DGS's densification score).
 
-    From the gradient by the centre in the world: a shift of one unit across the view moves the projection by
+    It follows from the gradient by the centre in the world: a shift of one unit across the view moves the projection by
     focal length / depth.
     """
     pose = step.camera.camera_from_world[0]
@@ -137,6 +136,6 @@ def _gradient_in_pixels(gaussians: Gaussians, step: Step) -> Float[Tensor, "n"]:
 
 
 def _error_covered(gaussians: Gaussians, step: Step) -> Float[Tensor, "n"]:
-    """Sum over the pixels of blending weight times absolute error, pixels."""
+    """Compute, for each Gaussian, the sum over the pixels of blending weight times absolute error, pixels."""
     weights = view_operator(gaussians, step.camera, step.rendering)
     return weights.blend_transpose(step.residual.abs().mean(2, keepdim=True))[:, 0]

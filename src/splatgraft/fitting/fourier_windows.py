@@ -1,7 +1,7 @@
-"""Windowed Fourier magnitudes of two images compared, with the gradient: numba kernels for windows of 16 pixels.
+"""Distance between the windowed Fourier magnitudes of two images, with its gradient, as numba kernels.
 
-A window is transformed as two products with the matrix of the discrete Fourier transform, in rows of 16 numbers that
-stay in the processor's first cache. Spectra of real windows are symmetric, so that rows 0 to 8 of each are enough.
+A window of 16x16 pixels is transformed by two products with the matrix of the discrete Fourier transform, in rows of 16
+numbers that fit into the first-level cache. Spectra of real windows are symmetric, so rows 0 to 8 are enough.
 """
 
 import math
@@ -23,7 +23,7 @@ _HALF = _ROWS * SIZE
 _ANGLES = 2 * math.pi / SIZE * (np.arange(SIZE)[:, None] * np.arange(SIZE) % SIZE)
 _COS, _SIN = np.cos(_ANGLES).astype(np.float32).ravel(), np.sin(_ANGLES).astype(np.float32).ravel()
 _SHARES = np.repeat(np.array([1, *[2] * (_ROWS - 2), 1], np.float32) / SIZE, SIZE)
-"""How often the full spectrum has each number of the half spectrum, over 16."""
+"""Multiplicity of each number of the half spectrum in the full one, over 16."""
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
 _ZERO = np.float32(0)
 
@@ -31,9 +31,12 @@ _ZERO = np.float32(0)
 def spectral_distance(
     image: Float[Tensor, "3 h w"], target: Float[Tensor, "3 h w"], window: Float[Tensor, "16 16"]
 ) -> Float[Tensor, ""]:
-    """Mean absolute difference of the Fourier magnitudes ("ortho") of windows that overlap by half.
+    """Compute the mean absolute difference of the Fourier magnitudes ("ortho") of windows that overlap by half.
 
-    Images are padded to whole windows, float32 on the CPU; the gradient flows to the first alone.
+    Args:
+        image: Image padded to whole windows, float32 on the CPU; receives the gradient.
+        target: Image of the same size; no gradient.
+        window: Weights of the pixels of a window.
     """
     return _Distance.apply(image, target, window)
 
@@ -60,9 +63,9 @@ class _Distance(torch.autograd.Function):
 @kernel
 @no_type_check
 def _transform(picture, place, factors, tables, work, spectrum):
-    """Fill `spectrum` with real, then imaginary parts of rows 0 to 8 of a window's spectrum.
+    """Fill `spectrum` with the real, then the imaginary parts of rows 0 to 8 of a window's spectrum.
 
-    `place`: flat index of the window's first pixel in `picture`, and the width of `picture`.
+    `place` is the flat index of the window's first pixel in `picture`, and the width of `picture`.
     """
     (at, stride), (cos, sin, _) = place, tables
     for y in range(1, _HOP):
@@ -72,7 +75,7 @@ def _transform(picture, place, factors, tables, work, spectrum):
         store(work, (SIZE - y) * SIZE, upper - lower)
     store(work, 0, load(picture, at) * load(factors, 0))
     store(work, _HOP * SIZE, load(picture, at + _HOP * stride) * load(factors, _HOP * SIZE))
-    down = 2 * _HALF  # of `spectrum`: a row of the transform along y
+    down = 2 * _HALF  # index in `spectrum` of a temporary row, transformed along y
     for row in range(_ROWS):
         real = load(work, 0) + load(work, _HOP * SIZE) * cos[row * SIZE + _HOP]
         imaginary = broadcast(float32(0))
@@ -94,7 +97,7 @@ def _transform(picture, place, factors, tables, work, spectrum):
 @kernel(fastmath=_FAST, error_model="numpy")
 @no_type_check
 def _differ(spectrum, wanted, shares):
-    """Sum of the differences of magnitudes; `spectrum` becomes the gradient of that sum."""
+    """Return the sum of absolute differences of magnitudes; `spectrum` becomes the gradient of that sum."""
     added = _ZERO
     for i in range(_HALF):
         real, imaginary = spectrum[i], spectrum[_HALF + i]
@@ -110,7 +113,7 @@ def _differ(spectrum, wanted, shares):
 @kernel
 @no_type_check
 def _add_back(spectrum, place, factors, tables, work, gradient):
-    """Add the transpose of `_transform` at `spectrum` to a window of `gradient`; `work` holds the rows along x."""
+    """Apply the transpose of `_transform` to `spectrum` and add the result to a window of `gradient`."""
     (at, stride), (cos, sin, _) = place, tables
     for row in range(_ROWS):
         real, imaginary = broadcast(float32(0)), broadcast(float32(0))
@@ -138,11 +141,11 @@ def _add_back(spectrum, place, factors, tables, work, gradient):
 @kernel(parallel=True)
 @no_type_check
 def _compare(image, target, factors, tables, gradient, sums):
-    """Fill `sums (c, rows of windows)`, and add to `gradient` where it is not empty."""
+    """Fill `sums` (channels, rows of windows), and add to `gradient` unless it is empty."""
     channels, rows = sums.shape
     height, width = image.shape[1:]
     columns = (width - SIZE) // _HOP + 1
-    for parity in range(2):  # windows of every second row do not overlap, so that threads write apart
+    for parity in range(2):  # windows of every second row do not overlap, so threads write to separate pixels
         count = (rows - parity + 1) // 2
         for task in numba.prange(channels * count):
             channel, row = task // count, parity + 2 * (task % count)

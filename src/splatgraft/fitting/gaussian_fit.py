@@ -1,6 +1,13 @@
-"""The fit of Gaussians to images: render, loss (3DGS, Eq. 7), gradient, sparse Adam, density control after each step.
+"""Fit of Gaussians to images by gradient descent (Kerbl et al. 2023, 3D Gaussian Splatting).
 
-Step i depends only on the state after step i - 1, the seed and i, so that a run resumed from a checkpoint gives the
+Each step
+
+1. renders one view;
+2. computes the loss (3DGS, Eq. 7), optionally with losses on depth and a colour map of the view;
+3. updates the visible Gaussians by sparse Adam;
+4. calls the density control.
+
+Step i depends only on the state after step i - 1, the seed and i. A run resumed from a checkpoint therefore gives the
 same bits as an uninterrupted one.
 """
 
@@ -25,9 +32,9 @@ from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, sile
 
 _REPORT_EVERY = 10  # steps
 _CHECKPOINT_SECONDS = 30.0
-_COPRIME = 3  # step through the cells of a stride: visits go through all of them, for strides of 2 and 4
+_COPRIME = 3  # step through the cells of a stride; coprime to 4 and 16, so visits reach all cells of strides 2 and 4
 MIN_SIDE_PX = 32
-"""Smallest side of an image that is fitted: below it the 11-pixel window of SSIM covers most of the image."""
+"""Smallest side of a fitted image, pixels; in smaller ones the 11-pixel window of SSIM covers most of the image."""
 
 
 @dataclass(frozen=True)
@@ -37,17 +44,19 @@ class View:
     camera: Cameras
     """A batch of one."""
     image: UInt8[Tensor, "h w 3"]
-    """sRGB times 255."""
+    """Target image, sRGB times 255."""
     mask: UInt8[Tensor, "h w 1"] | None = None
-    """Share of each pixel that shows what is fitted, times 255; the rest shows the background. None: all of it."""
+    """Foreground share of each pixel times 255; the rest shows the background. None: all foreground."""
     is_compared: Bool[Tensor, "h w 1"] | None = None
-    """Which pixels count; None: all."""
+    """Pixels that count in the loss; None: all."""
     low_pass_px2: float = RenderOptions.low_pass_px2
     """Low pass of the rendering, pixels squared."""
 
     def every_nth(self, stride: int, *, visit: int, index: int) -> "View":
-        """Every `stride`-th pixel along both axes, without averaging, so that the gradient is that of all pixels up to
-        chance; the first is another one for every visit of a view and every index of it. A small view stays whole."""
+        """Take every `stride`-th pixel along both axes, without averaging; small views stay whole.
+
+        The first pixel changes with `visit` and `index`, so the gradient estimates that of all pixels.
+        """
         if stride == 1 or min(self.image.shape[:2]) < stride * MIN_SIDE_PX:
             return self
         cell = (visit * _COPRIME + index) % stride**2
@@ -63,12 +72,12 @@ class View:
             self.image[top::stride, left::stride],
             None if self.mask is None else self.mask[top::stride, left::stride],
             None if self.is_compared is None else self.is_compared[top::stride, left::stride],
-            # that of the photograph stays
+            # the same low pass in pixels of the photograph
             self.low_pass_px2 / stride**2,
         )
 
     def target(self, background: Float[Tensor, "3"], drawn: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        """What a picture `drawn` over `background` should be; where nothing is compared, itself."""
+        """Compute the target of a picture `drawn` over `background`; pixels that are not compared keep `drawn`."""
         target = self.image.float() / 255
         if self.mask is not None:
             share = self.mask.float() / 255
@@ -77,14 +86,14 @@ class View:
 
 
 class Views(Protocol):
-    """What is fitted: v photographs."""
+    """The v photographs of a fit."""
 
     def __len__(self) -> int:
         """Number of photographs, v."""
         ...
 
     def at(self, index: int, *, visit: int, done: float) -> View:
-        """View `index` when it is seen for the time `visit` (from 0), after the share `done` in [0, 1] of all steps."""
+        """Return view `index` at its visit number `visit` (from 0), after the share `done` in [0, 1] of all steps."""
         ...
 
 
@@ -93,31 +102,31 @@ class LearningRates:
     """Learning rate of Adam for each field; a field with rate 0 is frozen and no gradient is computed for it."""
 
     means: float = 0.0
-    """World units per step at the start."""
+    """Rate of the centres at the start, world units."""
     means_final: float = 0.0
-    """World units per step at the end; the rate falls exponentially from `means` to it."""
+    """Rate of the centres at the end, world units; it decreases exponentially from `means`."""
     log_scales: float = 0.0
-    """Natural logarithm of world units."""
+    """Rate of the natural logarithms of the scales."""
     quaternions: float = 0.0
-    """Raw quaternion components."""
+    """Rate of the raw quaternion components."""
     opacity_logits: float = 0.0
-    """Before the sigmoid."""
+    """Rate of the opacities before the sigmoid."""
     sh: float = 0.0
-    """Band 0."""
+    """Rate of band 0."""
     sh_higher: float = 0.0
-    """Bands 1 to 3; 3DGS takes a twentieth of band 0."""
+    """Rate of bands 1 to 3; a twentieth of band 0 in 3DGS."""
     view_colors: float = 0.0
-    """Each view's own affine map of colours at the start, from where it falls to 0 along half a cosine; 0 fits none."""
+    """Rate of the views' affine colour maps at the start; it decreases to 0 along half a cosine. 0 fits no maps."""
     final: float = 1.0
     """Factor on the other rates at the end; reached along half a cosine in the last third."""
 
     def active(self) -> tuple[str, ...]:
-        """Names of the fields that are fitted."""
+        """Return the names of the fields that are fitted."""
         names = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
         return tuple(name for name in names if getattr(self, name) > 0)
 
     def at(self, field: str, done: float, columns: int) -> Float[Tensor, "c"]:
-        """Rate of each of the `columns` values of `field` per Gaussian, after the share `done` of all steps."""
+        """Compute the rates of the `columns` values of `field` per Gaussian, after the share `done` of all steps."""
         if field == "means":
             fallen = (self.means_final / self.means) ** done if self.means_final > 0 else 1.0
             return torch.full((columns,), self.means * fallen)
@@ -135,50 +144,50 @@ class FitOptions:
     """Length, rates, background and seed of a fit."""
 
     iterations: int
-    """Steps, one view each."""
+    """Number of steps, one view each."""
     rates: LearningRates
-    """Of every field."""
+    """Learning rate of every field."""
     background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)
-    """sRGB behind the scene; None: another one at every step, so that what is dark has no holes."""
+    """Colour behind the scene, sRGB in [0, 1]; None: random at every step, so that dark surfaces get no holes."""
     view_gains: Sequence[float] | None = None
-    """Brightness of each view over their mean, from which the views' colours start; None: the same for all."""
+    """Initial brightness of each view's colour map, over the mean of all views; None: equal."""
     surfaces: SurfaceLoss | None = None
-    """Losses on depth; None: none."""
+    """Losses on depth, if any."""
     seed: int = 0
-    """Of the order of views and of the backgrounds."""
+    """Seed of the order of views and of random backgrounds."""
 
 
 @dataclass(frozen=True)
 class ViewColors:
-    """The colours of each of v photographs over those of the scene: exposure and white balance, fitted beside it.
+    """Affine colour map of each of v photographs, for its exposure and white balance, with Adam's moments.
 
-    They are an affine map of the scene's (12 numbers instead of the embeddings of Martin-Brualla et al. 2021). The mean
-    of the maps stays the identity, so that the scene shows the mean appearance. Adam updates a view's map when the view
-    is visited, tens of times in all, which a slower second moment would not follow.
+    A map takes the scene's colours to the photograph's (12 numbers instead of the embeddings of Martin-Brualla et al.
+    2021). The mean of all maps stays the identity, so that the scene has the mean appearance.
     """
 
     maps: Float[Tensor, "v 3 4"]
-    """Matrix and offset of each view, less the identity."""
+    """Matrix and offset of each view, minus the identity."""
     first: Float[Tensor, "v 3 4"]
     """Running mean of gradients."""
     second: Float[Tensor, "v 3 4"]
     """Running mean of squared gradients."""
     steps: Int[Tensor, "v"]
-    """Updates of each view."""
+    """Number of updates of each view."""
 
     @staticmethod
     def start(gains: Float[Tensor, "v"]) -> "ViewColors":
-        """The scene times a factor of each view, 1 in the mean."""
+        """Make maps that multiply colours by each view's gain; the mean of all gains becomes 1."""
         maps = (gains - gains.mean())[:, None, None] * torch.eye(3, 4, device=gains.device)
         zeros = torch.zeros_like(maps)
         return ViewColors(maps, zeros, zeros, torch.zeros(len(gains), dtype=torch.int32, device=gains.device))
 
     def of(self, view: int) -> Float[Tensor, "3 4"]:
-        """Matrix and offset from the scene's colours to the view's."""
+        """Return matrix and offset from the scene's colours to the view's."""
         return self.maps[view] + torch.eye(3, 4, device=self.maps.device)
 
     def updated(self, view: int, gradient: Float[Tensor, "3 4"], rate: float) -> "ViewColors":
-        """After a step of Adam on one view; the mean of all maps is taken out."""
+        """Update one view's map by Adam, and subtract the mean of all maps."""
+        # a view has only tens of updates, too few for the usual beta_2 of 0.999
         beta_1, beta_2, epsilon = 0.9, 0.99, 1e-12
         maps, first, second, steps = (tensor.clone() for tensor in (self.maps, self.first, self.second, self.steps))
         steps[view] += 1
@@ -192,38 +201,38 @@ class ViewColors:
 
 @dataclass(frozen=True)
 class FitState:
-    """Everything besides options and views that the next step depends on."""
+    """State of a fit after a step."""
 
     iteration: int
-    """Steps done."""
+    """Number of steps done."""
     gaussians: Gaussians
-    """The scene as it is fitted so far."""
+    """Fitted scene."""
     moments: adam.Moments
-    """Adam's moments of the fields that are fitted."""
+    """Adam's moments of the fitted fields."""
     view_colors: ViewColors
-    """Colours of each view over the scene's."""
+    """Colour map of each view."""
     memory: dict[str, Tensor] = field(default_factory=dict)
-    """Tensors that the control stores between steps."""
+    """Tensors that the control keeps between steps."""
 
     def select(self, which: Tensor) -> "FitState":
-        """The state of the chosen Gaussians (indices or mask) with an empty `memory`."""
+        """Return the state of the chosen Gaussians (indices or mask) with an empty `memory`."""
         return replace(self, gaussians=self.gaussians.select(which), moments=self.moments.select(which), memory={})
 
 
 @dataclass(frozen=True)
 class Step:
-    """The last step, as the control sees it."""
+    """Results of the last step for the control."""
 
     camera: Cameras
-    """The view's camera."""
+    """Camera of the view."""
     visible: Bool[Tensor, "n"]
     """Gaussians in the view."""
     gradients: dict[str, Tensor]
     """Gradients of the loss, by field."""
     residual: Float[Tensor, "h w 3"]
-    """The rendered image minus what it should be, sRGB."""
+    """Rendered image minus target, sRGB."""
     rendering: RenderOptions
-    """With which it was rendered."""
+    """Options of the rendering."""
 
 
 Control = Callable[[FitState, Step], FitState]
@@ -239,10 +248,18 @@ def fit(
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
-    """Fit the fields of `gaussians` whose learning rate is above 0 to the images of `views`, at least one.
+    """Fit the fields of `gaussians` with a learning rate above 0 to the images of `views`.
 
-    The state is saved every 30 seconds and on Ctrl-C, and a run goes on from it. A ValueError where loss or gradients
-    are not finite.
+    Args:
+        gaussians: Initial Gaussians.
+        views: At least one view.
+        options: Length, rates, background and seed.
+        control: Called after every step.
+        progress: Called with steps done, steps in all and a short text.
+        checkpoint: Storage of the state, written every 30 seconds and on Ctrl-C; a stopped run continues from it.
+
+    Raises:
+        ValueError: The loss or a gradient is not finite.
     """
     names = options.rates.active()
     saved = checkpoint.load()
@@ -268,7 +285,7 @@ def fit(
 
 
 def _stepped(state: FitState, views: Views, options: FitOptions) -> tuple[FitState, float, Step]:
-    """The state after one step on one view, the loss, and what the control sees."""
+    """Do one step on one view; return the new state, the loss, and the results for the control."""
     rates, done = options.rates, state.iteration / options.iterations
     names = rates.active()
     visit, place = divmod(state.iteration, len(views))
@@ -307,7 +324,7 @@ def _stepped(state: FitState, views: Views, options: FitOptions) -> tuple[FitSta
 
 def _diverged(state: FitState, found: str) -> ValueError:
     return ValueError(
-        f"fit: expected finite numbers, found {found} at step {state.iteration} (the last checkpoint stands); "
+        f"fit: expected finite numbers, found {found} at step {state.iteration} (the last checkpoint is kept); "
         "lower the learning rates or look for broken images and cameras"
     )
 

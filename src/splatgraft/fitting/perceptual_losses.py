@@ -1,7 +1,7 @@
 """Perceptual losses between two images: L1 of windowed Fourier magnitudes, and LPIPS with VGG-16 (Zhang 2018).
 
-Every loss takes an image and a target, sRGB in [0, 1], and returns a scalar that is 0 where they are equal; the
-gradient flows to the image only. Nothing is downloaded: LPIPS reads weights from the disk.
+Every loss takes an image and a target, sRGB in [0, 1], and returns a scalar that is 0 if they are equal. Only the image
+receives a gradient. LPIPS reads its weights from the disk; nothing is downloaded.
 """
 
 import hashlib
@@ -24,30 +24,30 @@ HEADS_FILE = "vgg.pth"
 _VGG_LAYERS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
 _VGG_CHANNELS = (64, 128, 256, 512, 512)
 _WINDOW_PX = fourier_windows.SIZE
-_L1_SHARE = 0.1
+_L1_SHARE = 0.1  # weight of L1 between pixels beside the Fourier magnitudes
 
 ImageLoss = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], Float[Tensor, ""]]
 """A distance from the first image to the second, differentiable in the first."""
 
 
 def l1(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """Mean absolute difference."""
+    """Compute the mean absolute difference."""
     return (image - target).abs().mean()
 
 
 def windowed_fourier(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """L1 between the Fourier magnitudes of overlapping Hann windows, plus a tenth of L1 between the pixels.
+    """Compute L1 between the Fourier magnitudes of overlapping Hann windows, plus a tenth of L1 between the pixels.
 
-    Windows of 16 pixels every half window, all channels. Magnitudes do not depend on where in the window an edge lies,
-    so that views that disagree by a pixel favour one sharp edge over the average of two. They are scaled so that
-    independent noise has the same standard deviation in them as in the pixels.
+    Windows have 16 pixels and overlap by half. Magnitudes do not depend on the position of an edge in the window, so
+    views that disagree by a pixel favour one sharp edge over the average of two. Their scale is such that independent
+    noise has the same standard deviation in magnitudes and pixels.
     """
     window = _hann(image.dtype, image.device)
     planes, wanted_planes = _padded(image), _padded(target.detach())
     if image.device.type == "cpu" and image.dtype == torch.float32:
         spectral = fourier_windows.spectral_distance(planes, wanted_planes, window)
     else:
-        # how much of the full spectrum each column of a half spectrum holds
+        # share of the full spectrum in each column of a half spectrum
         shares = window.new_full((_WINDOW_PX // 2 + 1,), 2 / _WINDOW_PX)
         shares[0] = shares[-1] = 1 / _WINDOW_PX
         difference = _magnitudes(planes, window) - _magnitudes(wanted_planes, window)
@@ -57,14 +57,14 @@ def windowed_fourier(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3
 
 @lru_cache(maxsize=8)
 def _hann(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "size size"]:
-    """The window, of mean square 1."""
+    """Return the Hann window with a mean square of 1."""
     ramp = torch.hann_window(_WINDOW_PX, dtype=dtype, device=device)
     window = ramp[:, None] * ramp[None, :]
     return window / (window**2).mean().sqrt()
 
 
 def _padded(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "3 y x"]:
-    """Planes whose border repeats so far that windows cover every pixel twice in each direction."""
+    """Return planes with a repeated border, so that windows cover every pixel twice in each direction."""
     hop = _WINDOW_PX // 2
     pads = [(hop, hop + (-length) % hop) for length in image.shape[1::-1]]
     return F.pad(image.permute(2, 0, 1)[None], [*pads[0], *pads[1]], mode="replicate")[0]
@@ -76,9 +76,14 @@ def _magnitudes(planes: Float[Tensor, "3 y x"], window: Float[Tensor, "s s"]) ->
 
 
 def lpips_vgg(folder: Path | None = None) -> ImageLoss:
-    """LPIPS (Zhang 2018, version 0.1, VGG-16, linear heads) with weights from `folder`, by default torch hub's cache.
+    """Load LPIPS (Zhang 2018, version 0.1, VGG-16, linear heads) with weights from `folder`.
 
-    vgg16-397923af.pth is torchvision's; vgg.pth holds the heads and is lpips/weights/v0.1/vgg.pth of the lpips package.
+    Args:
+        folder: Folder of vgg16-397923af.pth from torchvision and of the heads vgg.pth, which is
+            lpips/weights/v0.1/vgg.pth in the lpips package; by default torch hub's cache.
+
+    Raises:
+        ValueError: A file is missing or is not these weights.
     """
     folder = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
     vgg, heads = _load(folder / VGG_FILE), _load(folder / HEADS_FILE)
@@ -97,7 +102,7 @@ def lpips_vgg(folder: Path | None = None) -> ImageLoss:
     ]
 
     def features(image: Float[Tensor, "h w 3"]) -> list[Tensor]:
-        """Activations (c, h', w') after the last convolution of each resolution, of unit length over the channels."""
+        """Compute activations (c, h', w') after each resolution's last convolution, normalised over the channels."""
         if min(image.shape[:2]) < 16:
             raise ValueError(f"lpips: expected images of at least 16x16 pixels, found {tuple(image.shape[:2])}")
         # the input scaling of the published weights
@@ -121,7 +126,7 @@ def lpips_vgg(folder: Path | None = None) -> ImageLoss:
 
 
 def is_published(path: Path) -> bool:
-    """Whether a file of weights has the hash that its published name ends in, as torch hub checks it."""
+    """Test whether a file of weights has the hash at the end of its published name, as torch hub does."""
     if not path.is_file():
         return False
     with path.open("rb") as stream:

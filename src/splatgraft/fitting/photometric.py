@@ -1,4 +1,4 @@
-"""The photometric loss of 3DGS, L1 with D-SSIM (Kerbl et al. 2023, Eq. 7), with a fused gradient on the CPU.
+"""Photometric loss of 3DGS, L1 with D-SSIM (Kerbl et al. 2023, Eq. 7), with a fused gradient on the CPU.
 
 The kernel applies four 11-tap separable filters forward and three backward to rows of interleaved channels. Its loops
 use few arrays, or planes of one array at constant distances, because only then can the compiler rule out aliasing.
@@ -19,14 +19,20 @@ _TAPS = np.exp(-((np.arange(6, dtype=np.float64) - 5) ** 2) / (2 * 1.5**2))
 _T0, _T1, _T2, _T3, _T4, _T5 = (np.float32(tap) for tap in _TAPS / (2 * _TAPS.sum() - _TAPS[5]))
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
 _ONE, _TWO = np.float32(1), np.float32(2)
-_BLOCK, _BAND, _EDGE = 512, 64, 30
+_BLOCK, _BAND, _EDGE = 512, 64, 30  # values per block, rows per task, values of ten pixels with three channels
 _FAST = {"contract", "nsz", "arcp", "reassoc"}
 
 
 def l1_dssim(
     image: Float[Tensor, "h w 3"], reference: Float[Tensor, "h w 3"], *, dssim_weight: float = 0.2
 ) -> Float[Tensor, ""]:
-    """(1 - w) |image - reference| + w (1 - SSIM), means over pixels (3DGS, Eq. 7); differentiable in `image`."""
+    """Compute (1 - w) |image - reference| + w (1 - SSIM), means over pixels (3DGS, Eq. 7).
+
+    Args:
+        image: Rendered image, sRGB; receives the gradient.
+        reference: Target image, sRGB.
+        dssim_weight: Weight w of D-SSIM.
+    """
     if min(image.shape[:2]) < 11:
         raise ValueError(f"l1_dssim: expected images of at least 11x11 pixels, found {image.shape[1]}x{image.shape[0]}")
     if image.device.type == "cpu" and image.dtype == torch.float32:
@@ -51,7 +57,7 @@ class _FusedL1Dssim(torch.autograd.Function):
 @kernel(fastmath=_FAST)
 @no_type_check
 def _across(out, row):
-    """out[j] = the same channel of eleven neighbours, row[j], row[j + 3], ... weighted by the window."""
+    """Set out[j] to the weighted sum of one channel of eleven neighbours: row[j], row[j + 3], ..."""
     for j in range(len(out)):
         out[j] = (
             _T0 * (row[j] + row[j + 30])
@@ -73,7 +79,7 @@ def _add_rows(out, first, second, tap):
 @kernel(fastmath=_FAST)
 @no_type_check
 def _down(out, ring, k, top):
-    """out = plane k of the eleven rows from `top` on, weighted by the window; row r lies at r modulo 11 of `ring`."""
+    """Set `out` to the weighted sum of plane k of the eleven rows from `top` on; row r is at r modulo 11 of `ring`."""
     out[:] = 0
     _add_rows(out, ring[top % 11, k], ring[(top + 10) % 11, k], _T0)
     _add_rows(out, ring[(top + 1) % 11, k], ring[(top + 9) % 11, k], _T1)
@@ -83,11 +89,14 @@ def _down(out, ring, k, top):
     _add_rows(out, ring[(top + 5) % 11, k], ring[(top + 5) % 11, k], _T5 / _TWO)
 
 
-# divisions follow numpy, since a check for zero would be a branch in the loop; denominators are at least C1 and C2
+# divisions follow numpy, because a check for zero would be a branch in the loop; denominators are at least C1 and C2
 @kernel(fastmath=_FAST, error_model="numpy")
 @no_type_check
 def _similarity(work):
-    """SSIM and its derivatives; planes of `_BLOCK`: in mean x, mean y, mean x^2 + y^2, mean xy, out by x, x^2, xy."""
+    """Return the sum of SSIM and replace filtered moments by SSIM's derivatives, in planes of `_BLOCK` values.
+
+    Planes hold mean x, mean y, mean x^2 + y^2 and mean xy on entry, and the derivatives by x, x^2 and xy on return.
+    """
     total = np.float32(0)
     for j in range(_BLOCK):
         mx, my = work[j], work[j + _BLOCK]
@@ -106,7 +115,7 @@ def _similarity(work):
 @kernel(fastmath=_FAST)
 @no_type_check
 def _moments_of_row(out, x, y):
-    """Horizontally filtered x, y, x^2 + y^2 and xy to out[0..3]."""
+    """Write horizontally filtered x, y, x^2 + y^2 and xy to out[0..3]."""
     scratch = np.empty(len(x), np.float32)
     _across(out[0], x)
     _across(out[1], y)
@@ -121,7 +130,7 @@ def _moments_of_row(out, x, y):
 @kernel(fastmath=_FAST)
 @no_type_check
 def _derivatives_of_row(out, filtered, top):
-    """SSIM of one row and, horizontally spread, its derivatives to out[0..2]; returns the sum of SSIM."""
+    """Return the sum of SSIM over one row, and write its horizontally spread derivatives to out[0..2]."""
     n = filtered.shape[2]
     planes = np.empty((4, n), np.float32)
     for plane in range(4):
@@ -145,7 +154,7 @@ def _derivatives_of_row(out, filtered, top):
 @kernel(fastmath=_FAST)
 @no_type_check
 def _gradient_of_row(out, spread, row, pair, scales):
-    """The derivatives spread vertically and joined with those of L1; returns the sum of |x - y|."""
+    """Spread the derivatives vertically, add those of L1, and return the sum of |x - y|."""
     x, y = pair
     scale_ssim, scale_l1 = scales
     part = np.empty(len(out), np.float32)
@@ -168,9 +177,9 @@ def _gradient_of_row(out, spread, row, pair, scales):
 @kernel(parallel=True, fastmath=_FAST)
 @no_type_check
 def _loss_and_gradient(x, y, weight):
-    """Loss and its gradient for images as rows of three interleaved channels.
+    """Compute the loss and its gradient for images as rows of three interleaved channels.
 
-    Bands of rows are independent; within a band, filtered rows are held in ring buffers of eleven rows in the cache.
+    Bands of rows are independent. In a band, ring buffers of eleven filtered rows stay in the cache.
     """
     h, width = x.shape
     rows, columns = h - 10, width - _EDGE

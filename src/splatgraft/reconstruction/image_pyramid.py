@@ -1,8 +1,8 @@
-"""8-bit image pyramids of a capture's photographs, and the pixels of them that a step sees.
+"""8-bit image pyramids of a capture's photographs, and the pixels that a step of the fit uses.
 
-The first steps use a coarse level. Later ones may use every n-th pixel of the photograph, from another first pixel at
-every visit: the low pass stays that of the photograph, so that the gradient is that of all pixels up to chance, at a
-fraction of their cost.
+The first steps use a coarse level. Later ones may use every n-th pixel of the photograph, with another first pixel at
+every visit. Their low pass is that of the full photograph, so the gradient is an estimate of that of all pixels at a
+fraction of the cost.
 """
 
 from collections.abc import Sequence
@@ -25,16 +25,16 @@ class Level:
     """All photographs at one size."""
 
     sampling: Sampling
-    """The size, the pixels that are fitted, and until when."""
+    """Size of the level, pixels that are fitted, and share of the steps at which the level ends."""
     cameras: tuple[Cameras, ...]
     """One batch of 1 per photograph, at the level's size."""
     images: tuple[UInt8[Tensor, "_ _ 3"], ...]
-    """sRGB times 255."""
+    """Photographs, sRGB times 255."""
 
 
 @dataclass(frozen=True)
 class Pyramid:
-    """The photographs to fit, from coarse to fine."""
+    """Photographs of a capture at several sizes, from coarse to fine."""
 
     levels: tuple[Level, ...]
 
@@ -43,7 +43,7 @@ class Pyramid:
         return len(self.levels[0].images)
 
     def reduced(self, longest_side_px: int) -> tuple[list[Cameras], list[Float[Tensor, "_ _ 3"]]]:
-        """Cameras and images of the coarsest level on the CPU, at most of the given size."""
+        """Return cameras and images of the coarsest level on the CPU, reduced to the given longest side."""
         cameras, images = [], []
         for camera, image in zip(self.levels[0].cameras, self.levels[0].images, strict=True):
             small = camera.to("cpu").resized(min(1.0, longest_side_px / int(camera.sizes.max())))
@@ -52,7 +52,7 @@ class Pyramid:
         return cameras, images
 
     def at(self, index: int, *, visit: int, done: float) -> View:
-        """View `index` when it is seen for the time `visit` (from 0), after the share `done` in [0, 1] of all steps."""
+        """Return view `index` at its visit number `visit` (from 0), after the share `done` in [0, 1] of all steps."""
         level = next((level for level in self.levels if done < level.sampling.until), self.levels[-1])
         view = View(level.cameras[index], level.images[index])
         return view.every_nth(level.sampling.stride, visit=visit, index=index)

@@ -1,8 +1,10 @@
-"""Initial Gaussians of a reconstruction: one per seed point (3DGS), random seeds where the cameras look, a far shell.
+"""Initial Gaussians of a reconstruction, one per seed point (Kerbl et al. 2023, 3D Gaussian Splatting).
 
-Sparse points end where features do. What lies behind them, such as plain walls, windows and sky, then has no Gaussian,
-and fits fill it by Gaussians close to the cameras. The shell lies behind the scene, in the colours of the photographs
-there. (Kerbl et al. 2024, A Hierarchical 3D Gaussian Representation, put a sphere of Gaussians around a scene.)
+Seed points are the sparse points, random points in the volume that most cameras see, and the points of a far shell.
+
+Sparse points lie only where features do. Plain walls, windows and sky behind them would start without Gaussians, and
+the fit would cover them with Gaussians close to the cameras. The shell lies behind the scene and has the photographs'
+colours (Kerbl et al. 2024, A Hierarchical 3D Gaussian Representation, put a sphere of Gaussians around a scene).
 """
 
 import math
@@ -24,35 +26,35 @@ _CANDIDATES = 200_000  # random points drawn at a time
 
 @dataclass(frozen=True)
 class SeedPoints:
-    """m points from which Gaussians start."""
+    """Positions, colours and largest widths of m initial Gaussians."""
 
     points: Float[Tensor, "m 3"]
-    """World units."""
+    """Centres, world units."""
     colors: Float[Tensor, "m 3"]
-    """sRGB in [0, 1]."""
+    """Colours, sRGB in [0, 1]."""
     widest: Float[Tensor, "m"]
-    """Bound on the Gaussian's standard deviation, world units; may be infinite."""
+    """Upper bound of the Gaussian's standard deviation, world units; may be infinite."""
 
     def __len__(self) -> int:
         return len(self.points)
 
     @staticmethod
     def none() -> "SeedPoints":
-        """No points."""
+        """Return no points."""
         return SeedPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
 
     def drawn(self, count: int, seed: int) -> "SeedPoints":
-        """At most `count` of the points, drawn at random, in their order."""
+        """Draw at most `count` of the points at random and keep their order."""
         return self.select(
             torch.randperm(len(self), generator=torch.Generator().manual_seed(seed))[:count].sort().values
         )
 
     def select(self, which: Int[Tensor, "k"] | Bool[Tensor, "m"]) -> "SeedPoints":
-        """The chosen points."""
+        """Return the chosen points."""
         return SeedPoints(self.points[which], self.colors[which], self.widest[which])
 
     def joined(self, other: "SeedPoints") -> "SeedPoints":
-        """These points, then the others."""
+        """Return these points, followed by the others."""
         return SeedPoints(
             torch.cat([self.points, other.points]),
             torch.cat([self.colors, other.colors]),
@@ -61,14 +63,20 @@ class SeedPoints:
 
 
 def scene_extent(cameras: Cameras) -> float:
-    """1.1 times the largest distance of a camera from the cameras' mean, world units (3DGS); 1 for a single place."""
+    """Compute 1.1 times the largest distance of a camera from the mean camera, world units (3DGS).
+
+    The extent is 1 if all cameras are in one place.
+    """
     centers = cameras.centers.cpu()
     radius = 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
     return radius if radius > 1e-6 else 1.0
 
 
 def from_points(seeds: SeedPoints) -> Gaussians:
-    """Isotropic Gaussians of opacity one half, as wide as the rms distance to the three nearest points at most."""
+    """Make isotropic Gaussians of opacity 0.5 with the RMS distance to the three nearest points as width.
+
+    Widths are bounded by `seeds.widest` and by ten times the median width.
+    """
     points, colors = seeds.points, seeds.colors
     n = len(points)
     array = points.double().numpy()
@@ -89,10 +97,15 @@ def from_points(seeds: SeedPoints) -> Gaussians:
 
 
 def random_seeds(cameras: Cameras, *, count: int, seed: int) -> SeedPoints:
-    """`count` points of random colours, uniform in the volume that most cameras see; each lies in front of a camera.
+    """Draw points of random colours, uniformly in the volume that most cameras see.
 
-    They are drawn in a sphere around the point nearest to all optical axes, with the cameras' mean distance as radius;
-    a point stays if more than half as many cameras see it as see the best-seen point.
+    Candidates lie in a sphere around the point nearest to all optical axes, with the cameras' mean distance as radius.
+    A candidate is kept if it is seen by more than half as many cameras as the candidate seen by most.
+
+    Args:
+        cameras: Cameras of the capture.
+        count: Number of points.
+        seed: Seed of positions and colours.
     """
     generator = torch.Generator().manual_seed(seed)
     focus, reach = looked_at(cameras)
@@ -135,21 +148,19 @@ def _views_that_see(points: Float[Tensor, "m 3"], cameras: Cameras) -> Float[Ten
     return count
 
 
-# set by hand
-_QUANTILE = 0.99  # quantile of the known points' distances from where the cameras look; wrong points lie beyond
+# the far shell; set by hand
+_QUANTILE = 0.99  # quantile of the sparse points' distances from the focus point; wrong points are farther
 _BEYOND = 1.5  # radius of the shell over that distance
 MIN_RADIUS = 6.0
-"""Smallest radius, over the cameras' distance from where they look."""
-_MIN_DIRECTIONS = 64  # directions by which the seen share of the sphere is found
-_NEIGHBOURS = 8  # seen points whose mean colour continues beyond them
-_PLAIN_SHARE = 0.05
-"""Share of the pixels at the images' edges above which a colour is taken for what was put behind the scene; that of
-black in the bonsai's photos is .01."""
-_PLAIN_TOLERANCE = 2.5 / 255  # how far a pixel of that colour may be from it, sRGB
+"""Smallest radius of the shell, over the cameras' mean distance from their focus point."""
+_MIN_DIRECTIONS = 64  # fewest directions that estimate the seen share of the sphere
+_NEIGHBOURS = 8  # nearest seen points whose mean colour an unseen point takes
+_PLAIN_SHARE = 0.05  # share of edge pixels above which their colour is a background; photos of a bonsai have .01 black
+_PLAIN_TOLERANCE = 2.5 / 255  # largest difference of a pixel from the background, sRGB
 
 
 def shell_radius(points: Float[Tensor, "m 3"], focus: Float[Tensor, "3"], reach: float) -> float:
-    """Distance of the shell from `focus`, world units; `reach` is the cameras' mean distance from it."""
+    """Compute the radius of the shell around `focus`, world units; `reach` is the cameras' mean distance from it."""
     if not len(points):
         return MIN_RADIUS * reach
     distances = (points.double() - focus.to(points.device)).norm(dim=1)
@@ -157,7 +168,7 @@ def shell_radius(points: Float[Tensor, "m 3"], focus: Float[Tensor, "3"], reach:
 
 
 def shows_surroundings(images: Sequence[Float[Tensor, "_ _ 3"]], background: tuple[float, float, float]) -> bool:
-    """Whether images show what is around, and not a scene cut out before the colour `background`."""
+    """Test whether images show surroundings, and not an object cut out in front of the colour `background`."""
     edges = torch.cat([torch.cat([image[0], image[-1], image[:, 0], image[:, -1]]) for image in images])
     plain = ((edges - torch.tensor(background)).abs() <= _PLAIN_TOLERANCE).all(1)
     return float(plain.double().mean()) <= _PLAIN_SHARE
@@ -172,10 +183,21 @@ def shell_points(
     count: int,
     margin_deg: float = 15.0,
 ) -> SeedPoints:
-    """About `count` points on a sphere that some camera sees, even, in the mean colour of all photographs there.
+    """Distribute points evenly over the part of a sphere that cameras see.
 
-    Points that no camera sees lie up to `margin_deg` from a seen one, so that walls do not end at the edge of a
-    photograph; they have the colours of the nearest that are seen.
+    A margin of unseen points is added, so that walls do not end at the edge of a photograph.
+
+    Args:
+        cameras: One batch of 1 per image.
+        images: sRGB in [0, 1].
+        center: Centre of the sphere, world units.
+        radius: Radius of the sphere, world units.
+        count: Approximate number of points.
+        margin_deg: Width of the unseen margin, as an angle at the centre.
+
+    Returns:
+        Points with the mean colour of all images that show them. Unseen points have the colour of the nearest seen
+        ones.
     """
     center = center.float()
     trial = _directions(max(count, _MIN_DIRECTIONS))
@@ -185,7 +207,6 @@ def shell_points(
     directions = _directions(max(1, round(count / share)))
     points = center + radius * directions
     colors, seen = _colors(points, cameras, images)
-    # where nothing is seen, the mean colour of the nearest directions that are
     neighbours = min(_NEIGHBOURS, int(seen.sum()))
     nearest = KDTree(directions[seen].numpy()).query(directions.numpy(), k=neighbours)[1]
     around = colors[seen][torch.from_numpy(nearest.reshape(len(directions), -1))].mean(1)
@@ -197,7 +218,7 @@ def shell_points(
 def _colors(
     points: Float[Tensor, "m 3"], cameras: Sequence[Cameras], images: Sequence[Tensor]
 ) -> tuple[Float[Tensor, "m 3"], Bool[Tensor, "m"]]:
-    """Mean colour of the points in all images, and which any camera sees."""
+    """Compute the mean colour of points over all images that show them, and which points are shown."""
     total, count = torch.zeros(len(points), 3), torch.zeros(len(points))
     for camera, image in zip(cameras, images, strict=True):
         pixels, depth = camera.project(points)
@@ -210,7 +231,7 @@ def _colors(
 
 
 def _near(directions: Float[Tensor, "m 3"], seen: Bool[Tensor, "m"], margin_deg: float) -> Bool[Tensor, "m"]:
-    """Which directions are seen, or closer than this to one that is."""
+    """Test which directions are seen, or within the margin of a seen one."""
     if not seen.any():
         return seen
     distance = KDTree(directions[seen].numpy()).query(directions.numpy())[0]
@@ -218,7 +239,7 @@ def _near(directions: Float[Tensor, "m 3"], seen: Bool[Tensor, "m"], margin_deg:
 
 
 def _directions(count: int) -> Float[Tensor, "m 3"]:
-    """Unit vectors on a Fibonacci lattice."""
+    """Return unit vectors on a Fibonacci lattice."""
     i = torch.arange(count, dtype=torch.float64) + 0.5
     z, turn = 1 - 2 * i / count, i * math.pi * (3 - math.sqrt(5))
     across = (1 - z.square()).clamp_min(0).sqrt()

@@ -1,4 +1,4 @@
-"""Options of a reconstruction, the presets of each quality, and the memory and the time that they lead to."""
+"""Options of a reconstruction, the presets of each quality, and predictions of memory and time."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,21 +15,22 @@ Quality = Literal["draft", "standard", "high", "full"]
 
 @dataclass(frozen=True)
 class Sampling:
-    """Which pixels the steps of a part of a fit see."""
+    """Pixels that are fitted during a part of the steps."""
 
     factor: float
-    """On the size of the photographs, which are averaged."""
+    """Factor on the size of the photographs, which are reduced by averaging."""
     stride: int
-    """Every how many pixels along each axis one is fitted, without averaging; which one changes with every visit."""
+    """Distance of fitted pixels along each axis, without averaging; the first pixel changes with every visit."""
     until: float
-    """Share of the steps after which the next entry holds."""
+    """Share of the steps at which this part ends."""
 
 
 SPARSE = (Sampling(0.35, 1, 0.4), Sampling(1.0, 2, 1.0))
-"""A quarter of the pixels gives as good a step as all of them (docs/results.md)."""
+"""Default schedule: a quarter of the pixels gives as good a step as all of them (docs/results.md)."""
 DENSE = (Sampling(0.5, 1, 0.3), Sampling(0.7071, 1, 0.6), Sampling(1.0, 1, 1.0))
-"""For a GPU, where pixels are cheap, and for small photographs."""
+"""Coarse-to-fine schedule with all pixels, for small photographs."""
 EVERY_PIXEL = (Sampling(1.0, 1, 1.0),)
+"""Full photographs at every step, for a GPU, which renders pixels cheaply."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class _Preset:
     longest_side_px: int
     sampling: tuple[Sampling, ...] = SPARSE
     beyond_draft: bool = False
-    """Not at `draft`: the numbers of the light estimate were fitted on draft scenes."""
+    """See `ReconstructOptions.beyond_draft`; false at `draft`, because the light estimate was fitted on such scenes."""
 
 
 _PRESETS: dict[str, _Preset] = {
@@ -53,34 +54,34 @@ _PRESETS: dict[str, _Preset] = {
 
 @dataclass(frozen=True)
 class ReconstructOptions:
-    """Length, size and seed of a reconstruction; None takes the value of the quality."""
+    """Length, size and seed of a reconstruction; None takes the preset of the quality."""
 
     quality: Quality = "standard"
     """`draft`: 1000 steps, 25k Gaussians; `standard`: 4000, 100k; `high`: 10000, 100k; `full`:
     30000, 1M, every pixel (for GPUs)."""
     iterations: int | None = None
-    """Steps, one view each; every schedule scales with it."""
+    """Steps, one view each; every schedule scales with this number."""
     budget: int | None = None
-    """Upper bound of the number of Gaussians, never exceeded."""
+    """Largest number of Gaussians, never exceeded."""
     resolution: float | None = None
     """Factor on the size of the images; None: longest side 640 (draft), 960 (standard, high) or 1600 px (full)
     at most."""
     sh_degree: int = 3
-    """Highest band of the colours; bands come in one by one during the first tenth of the steps."""
+    """Highest band of the colours; bands are added one by one during the first tenth of the steps."""
     photo_colors: bool | None = None
-    """Whether each photo has its own exposure and white balance, which then stay out of the scene; None: where its EXIF
-    says that they differ."""
+    """Whether each photo has its own exposure and white balance, which then stay out of the scene; None: if their EXIF
+    data differ in them."""
     eval_every: int = 0
-    """Every how many views one is held out, from the first (3DGS: 8); 0 holds out none."""
+    """Distance of held-out views, from the first view on (3DGS: 8); 0 holds out none."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """sRGB behind the scene."""
+    """Colour behind the scene, sRGB in [0, 1]."""
     seed: int = 0
-    """Seed of the order of views and of everything that is drawn by chance."""
+    """Seed of the order of views and of all random choices."""
     device: str = "cpu"
     """`cpu` or `cuda`."""
 
     def __post_init__(self) -> None:
-        """Raises: ValueError where a number is out of range."""
+        """Raise a ValueError if a number is out of range."""
         for name, low in (("iterations", 1), ("budget", 1), ("eval_every", 0)):
             value = getattr(self, name)
             if value is not None and value < low:
@@ -96,25 +97,28 @@ class ReconstructOptions:
 
     @property
     def all_iterations(self) -> int:
-        """Number of steps, given or of the quality."""
+        """Number of steps, given or from the preset."""
         return _PRESETS[self.quality].iterations if self.iterations is None else self.iterations
 
     @property
     def max_gaussians(self) -> int:
-        """The budget, given or of the quality."""
+        """Largest number of Gaussians, given or from the preset."""
         return _PRESETS[self.quality].budget if self.budget is None else self.budget
 
     @property
     def beyond_draft(self) -> bool:
-        """Whether splits look at covered errors, and, where the photos show what is around, the start has Gaussians
-        behind everything and each step draws the scene over another colour, so that dark surfaces have no holes."""
+        """Whether the fit uses the methods that are off at `draft`.
+
+        Splits depend also on the error that a Gaussian covers. If the photos show surroundings, a far shell lies behind
+        the scene, and every step has a random background, so that dark surfaces get no holes.
+        """
         return _PRESETS[self.quality].beyond_draft
 
     def sampling(self, served: Cameras) -> tuple[Sampling, ...]:
-        """Which pixels of the served views the steps see, from the first to the last.
+        """Return the schedule of the fitted pixels for the served views.
 
-        Pixels are left out only as long as a step still sees as many pixels as there are Gaussians: on a room at
-        352x248 with 25k Gaussians, which has fewer, every second pixel costs half a decibel.
+        Pixels are skipped only if a step still has at least as many pixels as there are Gaussians. On a room at 352x248
+        with 25k Gaussians, which has fewer, fitting every second pixel costs half a decibel.
         """
         sampling = _PRESETS[self.quality].sampling
         sizes = served.sizes.prod(1).double()
@@ -122,11 +126,11 @@ class ReconstructOptions:
         return DENSE if sampling is SPARSE and seen < self.max_gaussians else sampling
 
     def served(self, capture: PosedImages) -> PosedImages:
-        """The capture, resampled to the size at which it is fitted."""
+        """Resample the capture to the size at which it is fitted."""
         return capture.resized(self.served_size(capture.cameras))
 
     def served_size(self, cameras: Cameras) -> float:
-        """The factor by which images are resampled to the size at which they are fitted."""
+        """Compute the factor from the size of the images to the size at which they are fitted."""
         if self.resolution is not None:
             return self.resolution
         longest = int(cameras.sizes.max()) if len(cameras) else 1
@@ -135,22 +139,21 @@ class ReconstructOptions:
 
 _BASE_BYTES = 450 * 2**20  # python, torch and compiled kernels, resident
 _COPIES = 6  # copies of every field: value, gradient, two moments, and two while Gaussians are rearranged
-_BYTES_PER_PIXEL = 160
-"""For the largest view while it is rendered and compared: colour, transmittance, loss and their gradients."""
+_BYTES_PER_PIXEL = 160  # of the largest view: colour, transmittance, loss and their gradients
 _BYTES_PER_GAUSSIAN = 1500  # projections, tile lists and their gradients
 
 # CPU seconds of one step; fitted to runs of 1000 to 4000 steps on an AMD EPYC at 3 GHz (docs/results.md)
 _STEP_SECONDS = 6e-3
 _SECONDS_PER_GAUSSIAN = 1.0e-6  # projection, colours, Adam
 _SECONDS_PER_PIXEL = 0.3e-6  # blending and loss
-_ERROR_SHARE = 0.1  # share of all this that measuring the covered error adds
+_ERROR_SHARE = 0.1  # time that measuring the covered error adds, over the sum of the others
 
 
 def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:
-    """Upper estimate of the peak memory of the process that calls `reconstruct`, bytes.
+    """Predict an upper bound of the peak memory of the process that calls `reconstruct`, bytes.
 
-    Measured on the CPU with bands up to degree 3: 20k Gaussians at 352x248 took 492 MiB (534 predicted), 200k 974
-    (1035), 40k at 640x426 568 (626).
+    Measured on the CPU with bands up to degree 3: 20k Gaussians at 352x248 took 492 MiB (534 predicted), 200k took 974
+    (1035), and 40k at 640x426 took 568 (626).
     """
     served = options.served(capture)
     pixels = served.cameras.sizes.prod(1).double().tolist()
@@ -164,7 +167,7 @@ def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:
 
 
 def require_memory(capture: PosedImages, options: ReconstructOptions) -> None:
-    """Raise a ValueError that names the options to lower where less memory is available than predicted."""
+    """Raise a ValueError that names the options to lower if less memory is available than predicted."""
     needed, free = predict_memory(capture, options), available_memory(options.device)
     if free is not None and needed > free:
         raise ValueError(
@@ -174,7 +177,10 @@ def require_memory(capture: PosedImages, options: ReconstructOptions) -> None:
 
 
 def available_memory(device: str) -> int | None:
-    """Bytes available on `device` without swapping; None where the system does not report them (Linux and CUDA do)."""
+    """Return the bytes available on `device` without swapping; None if the system does not report them.
+
+    Linux and CUDA report them.
+    """
     if device.startswith("cuda"):
         return torch.cuda.mem_get_info(torch.device(device))[0]
     found = []
@@ -189,7 +195,10 @@ def available_memory(device: str) -> int | None:
 
 
 def predict_cpu_seconds(cameras: Cameras, options: ReconstructOptions) -> float:
-    """CPU seconds of `reconstruct`, within about a factor of 2: scenes differ in how many Gaussians a pixel sees."""
+    """Predict the CPU seconds of `reconstruct`, within about a factor of 2.
+
+    Scenes differ in the number of Gaussians per pixel.
+    """
     served = cameras.resized(options.served_size(cameras))
     sizes = served.sizes.prod(1).double()
     size = float(sizes.mean()) if len(sizes) else 0.0
@@ -197,14 +206,14 @@ def predict_cpu_seconds(cameras: Cameras, options: ReconstructOptions) -> float:
     for part in options.sampling(served):
         pixels += (part.until - begin) * size * (part.factor / part.stride) ** 2
         begin = part.until
-    # about a sixth fewer than the budget on average, as it is reached late
+    # on average about a sixth less than the budget, which is reached late
     gaussians = options.max_gaussians * 5 / 6
     step = _STEP_SECONDS + _SECONDS_PER_GAUSSIAN * gaussians + _SECONDS_PER_PIXEL * pixels
     return options.all_iterations * step * (1 + _ERROR_SHARE * options.beyond_draft)
 
 
 def describe_duration(seconds: float) -> str:
-    """Rounded as what it is, an estimate: '40 s', '6 minutes' or '1.5 hours'."""
+    """Round an estimate for people: '40 s', '6 minutes' or '1.5 hours'."""
     if seconds < 90:
         return f"{max(1, round(seconds / 10)) * 10} s"
     if seconds < 5400:

@@ -1,8 +1,8 @@
-"""Rough surface points by a plane sweep over small images: seeds where structure from motion found no points.
+"""Plane sweep over small images: rough surface points as seeds for a reconstruction with few sparse points.
 
-Along the rays of a grid of pixels of every view, the depth is taken at which patches agree best with the nearest views
-(Collins 1996; the mean over the better half of the views allows for occlusion, as Kang et al. 2001). A patch is a few
-pixels of a photograph reduced to a hundred or two, parallel to the image; costs are sums of absolute differences.
+Each view has a grid of pixels. Along the ray of each pixel, the depth is chosen at which a patch parallel to the image
+agrees best with the nearest views (Collins 1996). The cost of a patch is the mean absolute difference of its pixels.
+The mean over the better half of the views allows for occlusion (Kang et al. 2001).
 """
 
 import math
@@ -15,26 +15,33 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.reconstruction.initialization import SeedPoints
 
-_CELL_PX = 6  # distance of two rays in the reduced image
+_CELL_PX = 6  # spacing of the rays in the reduced image
 _DEPTHS = 32  # hypotheses per ray, evenly spaced in inverse depth
 _COMPARED_VIEWS = 4
-_PATCH_SPACING_PX = 1.5  # distance of the 3x3 pixels of a patch
-_MIN_ANGLE_DEG = 2.0  # between the directions of two views to what they look at; less tells nothing about depth
-_MIN_COSINE = 0.5  # smallest cosine of the angle between the optical axes of two views that are compared
+_PATCH_SPACING_PX = 1.5  # spacing of the 3x3 samples of a patch
+_MIN_ANGLE_DEG = 2.0  # smallest parallax between compared views at the focus point
+_MIN_COSINE = 0.5  # smallest cosine between the optical axes of compared views
 NEAR, _FAR = 0.4, 8.0
-"""Range of the distance from every camera, over the cameras' mean distance from what they look at."""
-_MIN_KNOWN = 100  # known points from which the nearest depth is taken instead, where it is larger
-_KNOWN_QUANTILE = 0.02  # share of the known points that are nearer to a camera; structure from motion has some outliers
-_TIE = 0.015  # difference in cost that tells nothing, four grey levels
-_MAX_COST = 0.12  # mean absolute difference in sRGB above which a ray gives no point
+"""Depth range, over the cameras' mean distance from their focus point."""
+_MIN_KNOWN = 100  # fewest known points that may raise the nearest depth
+_KNOWN_QUANTILE = 0.02  # share of the known points nearer than that depth; structure from motion has some outliers
+_TIE = 0.015  # insignificant difference in cost, four grey levels
+_MAX_COST = 0.12  # largest mean absolute difference, sRGB, at which a ray gives a point
 
 
 def sweep(
     cameras: Sequence[Cameras], images: Sequence[Float[Tensor, "_ _ 3"]], *, known: Float[Tensor, "p 3"], reach: float
 ) -> SeedPoints:
-    """Points on the rays through grid cells without a known point, as wide as neighbouring rays are apart at most.
+    """Find surface points on the rays through grid cells that hold no known point.
 
-    `images`: small. `reach`: the cameras' mean distance from what they look at, world units.
+    Args:
+        cameras: One batch of 1 per image.
+        images: Small images, sRGB in [0, 1].
+        known: Sparse points, world units.
+        reach: Mean distance of the cameras from their focus point, world units.
+
+    Returns:
+        Points with the patch's mean colour, bounded in width by the distance to the neighbouring rays.
     """
     nearest = NEAR * reach
     if len(known) >= _MIN_KNOWN:
@@ -61,7 +68,7 @@ def _points_of_view(
     images: Sequence[Tensor],
     depths: Float[Tensor, "d"],
 ) -> SeedPoints:
-    """Points on the rays through `centers` of one view, compared with the others; `depths` end with the nearest."""
+    """Find points on the rays through `centers` of one view by comparing it with others; `depths` end nearest."""
     camera = cameras[view]
     step = _PATCH_SPACING_PX * torch.tensor([-1.0, 0.0, 1.0])
     dy, dx = (grid.flatten() for grid in torch.meshgrid(step, step, indexing="ij"))
@@ -71,7 +78,7 @@ def _points_of_view(
     costs = torch.stack([_cost(patches, own, cameras[j], images[j]) for j in others])
     costs = costs.sort(0).values[: (len(others) + 1) // 2].mean(0)
     best = costs.min(0).values
-    # of the depths that explain the patch equally well, the farthest hides no other view's surface
+    # among depths of equal cost, the farthest hides no surface of another view
     index = (costs <= best + _TIE).int().argmax(0)
     points = patches[index, torch.arange(len(centers)), patches.shape[2] // 2]
     good = (best < _MAX_COST) & (_nearest(points, cameras) > depths[-1])
@@ -80,7 +87,7 @@ def _points_of_view(
 
 
 def _compared_views(view: int, cameras: Sequence[Cameras], reach: float) -> list[int]:
-    """The nearest views that look the same way from another place."""
+    """Choose the nearest views with a similar direction and another position."""
     centers = torch.cat([camera.centers for camera in cameras]).float()
     forward = torch.cat([camera.world_from_camera[:, :3, 2] for camera in cameras]).float()
     distance, same = (centers - centers[view]).norm(dim=1), forward @ forward[view]
@@ -90,12 +97,12 @@ def _compared_views(view: int, cameras: Sequence[Cameras], reach: float) -> list
 
 
 def _nearest(points: Float[Tensor, "m 3"], cameras: Sequence[Cameras]) -> Float[Tensor, "m"]:
-    """Distance to the nearest camera: a point in front of another one would cover its view."""
+    """Compute the distance of each point to the nearest camera; a point close to any camera would cover its view."""
     return torch.cdist(points, torch.cat([camera.centers for camera in cameras]).float()).min(1).values
 
 
 def _rays(camera: Cameras, pixels: Float[Tensor, "m k 2"]) -> Float[Tensor, "m k 3"]:
-    """World directions of depth 1 through pixels."""
+    """Compute the world directions of rays through pixels, at depth 1."""
     k, pose = camera.intrinsics[0].float(), camera.world_from_camera[0].float()
     plane = torch.stack(
         [(pixels[..., 0] - k[0, 2]) / k[0, 0], (pixels[..., 1] - k[1, 2]) / k[1, 1], torch.ones_like(pixels[..., 0])],
@@ -105,7 +112,7 @@ def _rays(camera: Cameras, pixels: Float[Tensor, "m k 2"]) -> Float[Tensor, "m k
 
 
 def _project(points: Float[Tensor, "*n 3"], camera: Cameras) -> tuple[Tensor, Tensor]:
-    """Pixels and depths."""
+    """Project points to pixels and depths."""
     pose, k = camera.camera_from_world[0].float(), camera.intrinsics[0].float()
     x = points @ pose[:3, :3].T + pose[:3, 3]
     z = x[..., 2:]
@@ -114,7 +121,7 @@ def _project(points: Float[Tensor, "*n 3"], camera: Cameras) -> tuple[Tensor, Te
 
 
 def _sampled(image: Float[Tensor, "h w 3"], pixels: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
-    """Bilinear samples."""
+    """Sample an image bilinearly."""
     h, w, _ = image.shape
     grid = pixels.reshape(1, 1, -1, 2) * torch.tensor([2 / w, 2 / h]) - 1
     values = torch.nn.functional.grid_sample(
@@ -126,7 +133,7 @@ def _sampled(image: Float[Tensor, "h w 3"], pixels: Float[Tensor, "*n 2"]) -> Fl
 def _cost(
     patches: Float[Tensor, "d m k 3"], own: Float[Tensor, "m k 3"], camera: Cameras, image: Tensor
 ) -> Float[Tensor, "d m"]:
-    """Mean absolute difference of patches; large where the patch's centre is out of view."""
+    """Compute the mean absolute difference of patches; 1 if the patch's centre is out of view."""
     pixels, depth = _project(patches, camera)
     difference = (_sampled(image, pixels) - own).abs().mean((2, 3))
     middle = pixels[:, :, pixels.shape[2] // 2]
@@ -136,7 +143,7 @@ def _cost(
 
 
 def _occupied(points: Tensor, camera: Cameras, cells: tuple[int, int]) -> Bool[Tensor, "c"]:
-    """Which of columns x rows cells of an image hold a point."""
+    """Test which of columns x rows cells of an image hold a point."""
     columns, rows = cells
     out = torch.zeros(rows * columns, dtype=torch.bool)
     pixels, depth = _project(points, camera)

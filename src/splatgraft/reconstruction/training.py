@@ -1,9 +1,11 @@
 """Reconstruction of a scene: initial Gaussians, schedules of learning rates and density, and the fit.
 
-Learning rates are 3DGS's published ones for 30000 steps. A shorter run takes larger ones and starts from more opaque
-Gaussians. Measured on a room of 36 views at 352x248, 25k Gaussians, 1000 steps, held-out PSNR: published rates
-25.2 dB, twice 26.7, four times 27.5, four times with initial opacity 0.5 and rates that fall at the end 27.8, and with
-rates other than the centres' eight times 28.1 (a bunch of bananas, 16 photographs: 29.0 and 29.1).
+Learning rates are 3DGS's published ones for 30000 steps. A shorter run has higher rates and starts from more opaque
+Gaussians. Held-out PSNR on a room (36 views of 352x248 pixels, 25k Gaussians, 1000 steps):
+
+- published rates: 25.2 dB; twice these: 26.7; four times: 27.5;
+- four times, with initial opacity 0.5 and rates that decrease at the end: 27.8 (16 photographs of bananas: 29.0);
+- the same, with all rates but the centres' eight times: 28.1 (bananas: 29.1).
 """
 
 from dataclasses import replace
@@ -34,26 +36,20 @@ from splatgraft.reconstruction.plane_sweep import sweep
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
 _PUBLISHED_ITERATIONS = 30_000  # steps for which the published values hold (3DGS)
-_MANY_POINTS, _MIN_POINTS = 1000, 100
-"""Sparse points below which more are found by a plane sweep; points of both kinds below which random ones are taken."""
+_MANY_POINTS = 1000  # sparse points below which a plane sweep adds more
+_MIN_POINTS = 100  # sparse and swept points below which random ones replace them
 _SMALL_SIDE_PX = 160  # longest side of the images of the plane sweep and of the far shell's colours
-_SHELL_SHARE = 0.05  # gaussians of the far shell over the budget; set by hand
-_START_SHARE = 0.6
-"""Gaussians at the start at most, over the budget; the others come where the density control wants them."""
-_PUBLISHED_OPACITY, _SHORT_RUN_OPACITY = 0.1, 0.5
-"""Opacity at the start of a run of the published length or longer (3DGS), and of a shorter run."""
-_BAND_SHARE = 30  # all steps over the steps between two bands of colour
-_DENSIFY_EVERY, _MIN_DENSIFICATIONS = 100, 20
-"""Most steps between two densifications (3DGS), and least number of such intervals in a run."""
-_FULL_AT, _STOP_AT = 0.6, 0.8
-"""Shares of the steps after which the budget may be reached, and after which nothing is split or removed."""
-_ERROR_EVERY = 4  # steps between two measurements of the error that each Gaussian covers, where the options ask for it
-_MEANS_POWER, _MAX_MEANS = 0.5, 4.0
-"""Exponent of the published length over the run's, the factor on the rate of the centres, and its bound."""
-_OTHERS_POWER, _MAX_OTHERS = 0.6, 8.0
-"""The same for all other rates."""
+_SHELL_SHARE = 0.05  # Gaussians of the far shell over the budget; set by hand
+_START_SHARE = 0.6  # most Gaussians at the start, over the budget; density control adds the others
+_PUBLISHED_OPACITY, _SHORT_RUN_OPACITY = 0.1, 0.5  # initial opacity at the published length (3DGS), and below it
+_BAND_SHARE = 30  # number of steps over the steps between two bands of colour
+_DENSIFY_EVERY, _MIN_DENSIFICATIONS = 100, 20  # most steps between densifications (3DGS), and fewest densifications
+_FULL_AT, _STOP_AT = 0.6, 0.8  # shares of the steps at which the budget is reached, and after which density is fixed
+_ERROR_EVERY = 4  # steps between measurements of the error that each Gaussian covers
+_MEANS_POWER, _MAX_MEANS = 0.5, 4.0  # factor on the rate of the centres: (published / own length)^power, and its bound
+_OTHERS_POWER, _MAX_OTHERS = 0.6, 8.0  # the same for all other rates
 _COLOR_RATE = 0.003  # learning rate of each photograph's own affine map of colours
-_SHORT_RUN_FINAL = 0.1  # last rate over the first, for all but the centres, in a shorter run
+_SHORT_RUN_FINAL = 0.1  # last rate over the first in a shorter run, except for the centres
 
 
 def reconstruct(
@@ -66,10 +62,11 @@ def reconstruct(
     """Fit Gaussians to a capture (3D Gaussian Splatting, Kerbl et al. 2023; density control after Taming 3DGS).
 
     Args:
-        capture: Posed images; sparse points are the start where there are at least 100.
+        capture: Posed images; Gaussians start at the sparse points if there are at least 1000 of these, else also at
+            points of a plane sweep.
         options: Length, size, resolution and seed.
         progress: Called with steps done, steps in all and a short text.
-        checkpoint: Where the state is saved, and from where a run that was stopped continues.
+        checkpoint: Storage of the state; a stopped run continues from it.
 
     Returns:
         At most `options.max_gaussians` Gaussians in the frame of the cameras, on `options.device`.
@@ -99,7 +96,7 @@ def reconstruct(
     band_every = max(1, options.all_iterations // _BAND_SHARE)
 
     def control(state: FitState, step: Step) -> FitState:
-        """Density, and one more band of colour every `band_every` steps."""
+        """Update the density, and add a band of colour every `band_every` steps."""
         state = density.update(state, step)
         degree = min(options.sh_degree, state.iteration // band_every)
         if degree <= state.gaussians.sh_degree:
@@ -126,7 +123,7 @@ def _start(
     far_shell: bool,
     progress: Progress,
 ) -> Gaussians:
-    """Gaussians at sparse points; of few, also at points of a plane sweep; else at random; and the far shell."""
+    """Make Gaussians at sparse points, swept points if these are few, random ones if still few, and the far shell."""
     focus, reach = looked_at(capture.cameras)
     budget = options.max_gaussians
     seeds = SeedPoints(
@@ -138,9 +135,9 @@ def _start(
         seeds = seeds.joined(swept)
         if len(seeds) < _MIN_POINTS:
             seeds = random_seeds(capture.cameras, count=max(budget // 4, 1), seed=options.seed)
-            found = f"{found}: starting from {len(seeds)} random ones where the cameras look"
+            found = f"{found}: starting from {len(seeds)} random ones in the volume that most cameras see"
         else:
-            found = f"{found}: {len(swept)} found by comparing views"
+            found = f"{found}: {len(swept)} more found by comparing views"
         progress(0, options.all_iterations, found)
     shell = SeedPoints.none()
     if far_shell:
@@ -149,14 +146,14 @@ def _start(
     most = max(1, int(_START_SHARE * budget))
     start = from_points(seeds.drawn(max(1, most - len(shell)), options.seed))
     if len(shell):
-        # apart from the others, whose spacing bounds that of isolated points
+        # made separately, because the widths of the shell's Gaussians would be bounded by those of the others
         start = concatenate([start, from_points(shell)])
     opacity = _SHORT_RUN_OPACITY if options.all_iterations < _PUBLISHED_ITERATIONS else _PUBLISHED_OPACITY
     return replace(start, opacity_logits=torch.full_like(start.opacity_logits, opacity).logit())
 
 
 def _rates(cameras: Cameras, options: ReconstructOptions) -> LearningRates:
-    """3DGS's published rates, higher for shorter runs."""
+    """Return 3DGS's published rates, increased for shorter runs."""
     extent = scene_extent(cameras)
     shorter = max(1.0, _PUBLISHED_ITERATIONS / options.all_iterations)
     means_factor = min(_MAX_MEANS, shorter**_MEANS_POWER)

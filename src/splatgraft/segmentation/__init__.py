@@ -1,4 +1,4 @@
-"""Segment: from object masks of a capture's images to the Gaussians of the object."""
+"""Segmentation: object masks of a capture's images, and the object's Gaussians."""
 
 from splatgraft.segmentation.capture_masks import CUT_SIDE_PX, CutRequest, cut_capture, network_masks
 from splatgraft.segmentation.cut_object import (

@@ -1,6 +1,7 @@
-"""Object masks of posed pictures that agree in 3D: cut, lifted to the Gaussians, rendered, and cut again.
+"""Object masks of posed pictures that are consistent in 3D.
 
-How well the masks agree in the end is measured against the selection of Gaussians, rendered into each picture.
+Each round cuts the object out of every picture, lifts all masks to the Gaussians, and renders this selection into the
+pictures for the next round. The agreement of the final masks is their IoU with the rendered selection.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -18,26 +19,25 @@ from splatgraft.runtime.progress import Progress, silent
 from splatgraft.segmentation.lift import share_inside, weight_inside
 
 MIN_AGREEMENT = 0.7
-"""Mean IoU below which the object is doubtful: almost a third of what masks and selection cover differs. An outline
-that misses by 2% of the object's diameter all around gives 0.92; thin parts in a short reconstruction give 0.8."""
-_MIN_VIEW_AGREEMENT = 0.5
-"""IoU below which the mask of one picture is doubtful: it has less in common with the object than not."""
-_MIN_PIXELS = 12  # pixels of the selection below which a picture does not show the object
+"""Mean IoU below which the object is doubtful. An outline that is off by 2% of the object's diameter all around gives
+0.92; thin parts in a short reconstruction give 0.8."""
+_MIN_VIEW_AGREEMENT = 0.5  # IoU below which the mask of one picture is doubtful
+_MIN_PIXELS = 12  # fewest pixels of the selection in a picture that shows the object
 _ROUNDS = 2  # most rounds before the last, which cuts every picture; set by hand
 _VOTING = 32  # most pictures, evenly spaced, that are cut in the rounds before the last; set by hand
-_SETTLED = 0.97
-"""Mean IoU of the masks with those of the round before from which another round would change nothing that shows."""
+_SETTLED = 0.97  # mean IoU with the masks of the round before, above which another round has no visible effect
 
 
 ViewCutter = Callable[[Tensor, Tensor, ViewPrompt], Tensor]
-"""From a picture (h, w, 3), sRGB in [0, 1], the share (h, w) of each of its pixels that belongs to the object by the 3D
-selection, not 0 everywhere, and what the user says, to the object's mask (h, w), 0 or 1: `grabcut_mask`, or the method
-`cut` of a loaded `Sam2`."""
+"""Algorithm that cuts the object out of one picture: `grabcut_mask`, or the method `cut` of a loaded `Sam2`.
+
+Arguments: the picture (h, w, 3), sRGB in [0, 1]; the share (h, w) of each pixel that belongs to the object by the 3D
+selection, not 0 everywhere; the user's points and rectangle. Result: the object's mask (h, w), 0 or 1."""
 
 
 @dataclass(frozen=True)
 class CutViews:
-    """v pictures that are cut, and what the user says about some."""
+    """v pictures to cut, and the user's points and rectangles in some of them."""
 
     images: Sequence[Float[Tensor, "_ _ 3"]]
     """sRGB in [0, 1], one per camera."""
@@ -54,20 +54,20 @@ class Agreement:
     names: tuple[str, ...]
     """Names of the pictures."""
     iou: Float[Tensor, "v"]
-    """In [0, 1]; nan where neither mask nor selection shows in the picture."""
+    """IoU in [0, 1]; nan if neither mask nor selection shows in the picture."""
 
     @property
     def mean(self) -> float:
-        """Mean over the pictures that show the object; 0 where none does."""
+        """Mean IoU over the pictures that show the object; 0 without such pictures."""
         return float(self.iou.nanmean().nan_to_num(0.0))
 
     @property
     def doubtful(self) -> list[int]:
-        """Pictures whose mask is doubtful, the worst first."""
+        """Indices of the pictures with a doubtful mask, the worst first."""
         return [int(i) for i in self.iou.nan_to_num(1.0).argsort() if float(self.iou[i]) < _MIN_VIEW_AGREEMENT]
 
     def as_json(self) -> dict[str, object]:
-        """The mean, and the value of each picture that shows the object."""
+        """Return the mean, and the IoU of each picture that shows the object."""
         views = {n: round(float(v), 4) for n, v in zip(self.names, self.iou, strict=True) if not bool(v.isnan())}
         return {"mean_iou": round(self.mean, 4), "views": views}
 
@@ -84,19 +84,22 @@ def cut_object(
     """Cut the object out of every picture, in rounds, until the masks no longer change.
 
     Each round renders the 3D selection into every picture, cuts the picture, and lifts all masks together to a new
-    selection: a mask that is wrong in one picture is outvoted by the others, and what is not allowed stays outside, so
-    that masks do not grow from round to round over a wall of the object's colour.
+    selection. The other pictures outvote a wrong mask. The limit `allowed` keeps masks from growing over a wall of the
+    object's colour.
 
     Args:
         views: The pictures.
         scene: n Gaussians.
-        share: First selection: the share of each Gaussian that is the object's, in [0, 1].
-        cutter: The algorithm for one picture.
-        allowed: Which Gaussians may be the object's whatever the pictures say; None for all.
+        share: First selection: share of each Gaussian in the object, in [0, 1].
+        cutter: Algorithm for one picture.
+        allowed: True for Gaussians that may belong to the object; None allows all.
         progress: Called per picture.
 
     Returns:
-        A mask per picture, 0 or 1, and the share of each Gaussian in the masks, in [0, 1].
+        A mask per picture, 0 or 1, and the share of each Gaussian inside the masks, in [0, 1].
+
+    Raises:
+        ValueError: Fewer than two pictures show the object.
     """
     count = len(views.images)
     voting = sorted({round(i) for i in torch.linspace(0, count - 1, min(count, _VOTING)).tolist()})
@@ -105,14 +108,14 @@ def cut_object(
     masks: dict[int, Tensor] = {}
 
     def cut_and_lift(chosen: Sequence[int], what: str) -> tuple[dict[int, Tensor], Tensor]:
-        """The masks of the chosen pictures, cut by `feature`, and the feature lifted from them."""
+        """Cut the chosen pictures by `feature`, and lift their masks to a new feature."""
         total, made = torch.zeros(scene.count, 2, device=scene.device), {}
         for done, index in enumerate(chosen):
             progress(done, len(chosen), f"cutting masks, {what}")
             operator = view_operator(scene, views.cameras[index], RenderOptions())
             lifted = operator.blend(feature[:, None])[..., 0].cpu()
             prompt = views.prompts.get(index, ViewPrompt())
-            # a picture in which neither the selection nor a click shows has no object
+            # without a visible selection or click, the mask is empty
             shows = int((lifted > 0.5).sum()) >= _MIN_PIXELS or len(prompt.inside)
             made[index] = cutter(views.images[index], lifted, prompt) if shows else torch.zeros_like(lifted)
             total += weight_inside(operator, made[index].to(scene.device))
@@ -142,7 +145,7 @@ def measure_agreement(
     *,
     progress: Progress = silent,
 ) -> Agreement:
-    """Compare the masks, one per camera, with the selected Gaussians, rendered in front of and behind all others."""
+    """Compare the masks, one per camera, with the selected Gaussians rendered among all others."""
     feature = selection[:, None].float().to(scene.device)
     values = []
     for index, (mask, camera) in enumerate(zip(masks, cameras, strict=True)):
@@ -154,7 +157,7 @@ def measure_agreement(
 
 
 def _iou(first: Float[Tensor, "h w"], second: Float[Tensor, "h w"]) -> float:
-    """Intersection over union of two masks at one half; nan where both are empty."""
+    """Compute the intersection over union of two masks, thresholded at 0.5; nan if both are empty."""
     a, b = first > 0.5, second > 0.5
     either = int((a | b).sum())
     return int((a & b).sum()) / either if either else float("nan")

@@ -1,8 +1,8 @@
-"""The object's mask in one picture by GrabCut (Rother et al. 2004; OpenCV), which separates by colour.
+"""Object mask of one picture by GrabCut (Rother et al. 2004; OpenCV), which separates by colour.
 
-What the object is comes from the 3D selection, rendered into the picture; colour decides only in a band along its
-outline, since over a whole picture it takes a table of the object's colour or leaves out a part of another one.
-All constants are set by hand.
+The 3D selection, rendered into the picture, defines the object. Colour decides only in a band along its outline.
+Over a whole picture, colour would add a table of the object's colour, or leave out a part of another colour. All
+constants are set by hand.
 """
 
 import cv2
@@ -13,21 +13,29 @@ from torch import Tensor
 
 from splatgraft.core.prompts import ViewPrompt
 
-_ITERATIONS = 2  # grabCut iterations per picture
-_LIGHTNESS = 0.5  # weight of lightness against colour: below 1, a shadow looks more like the ground on which it lies
-_CERTAIN = 0.95  # lifted share from which a pixel is certainly object; below one minus this it is certainly background
-_BAND = 0.06
-"""Half width of the band along the outline in which colour decides, over the square root of the mask's area."""
-_WINDOW = 0.5  # margin around the object that is looked at, over the larger side of its bounding box
-_CLICK_PX = 3  # radius of the disc around a point that the user gave, pixels
-_SPECK = 50  # the largest part of the mask over the largest part that is removed, by area
-_HOLE = 1000  # the mask over the largest hole that is filled, by area
+_ITERATIONS = 2  # GrabCut iterations per picture
+_LIGHTNESS = 0.5  # weight of lightness against colour; below 1, a shadow is more similar to the ground around it
+_CERTAIN = 0.95  # lifted share above which a pixel is certainly object; below one minus this, certainly background
+_BAND = 0.06  # half width of the band along the outline in which colour decides, over sqrt(mask area)
+_WINDOW = 0.5  # margin of GrabCut's window around the object, over the larger side of its bounding box
+_CLICK_PX = 3  # radius of the disc around a user's point
+_SPECK = 50  # area of the largest part of the mask over that of the largest removed part
+_HOLE = 1000  # area of the mask over that of the largest filled hole
 
 
 def grabcut_mask(
     image: Float[Tensor, "h w 3"], lifted: Float[Tensor, "h w"], prompt: ViewPrompt
 ) -> Float[Tensor, "h w"]:
-    """The object's mask, 0 or 1, in one picture, sRGB in [0, 1]; a `ViewCutter`."""
+    """Cut the object out of one picture by GrabCut; a `ViewCutter`.
+
+    Args:
+        image: sRGB in [0, 1].
+        lifted: Share of each pixel that belongs to the object by the 3D selection.
+        prompt: The user's points and rectangle.
+
+    Returns:
+        The object's mask, 0 or 1.
+    """
     prior = _prior(lifted.cpu().numpy(), prompt)
     labels = np.zeros_like(prior)
     window = _window(prior != cv2.GC_BGD)
@@ -36,7 +44,7 @@ def grabcut_mask(
 
 
 def _prior(lifted: Float[np.ndarray, "h w"], prompt: ViewPrompt) -> UInt8[np.ndarray, "h w"]:
-    """GrabCut's classes: certain and likely object and background."""
+    """Compute GrabCut's classes: certain and likely object, certain and likely background."""
     likely = (lifted > 0.5).astype(np.uint8)
     width = max(1, round(_BAND * float(likely.sum()) ** 0.5))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * width + 1, 2 * width + 1))
@@ -55,7 +63,7 @@ def _prior(lifted: Float[np.ndarray, "h w"], prompt: ViewPrompt) -> UInt8[np.nda
 
 
 def _window(shown: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
-    """Rows and columns of the bounding box of `shown` with a margin; everything where nothing shows."""
+    """Return rows and columns of the bounding box of `shown` with a margin; the whole picture if it is empty."""
     if not shown.any():
         return slice(None), slice(None)
     rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
@@ -80,7 +88,7 @@ def _labels(image: Float[Tensor, "h w 3"], prior: UInt8[np.ndarray, "h w"]) -> U
 
 
 def _without_specks(mask: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """The mask without small separate parts and small holes."""
+    """Remove small separate parts of the mask and fill small holes."""
     for value in (1, 0):
         count, labels, stats, _ = cv2.connectedComponentsWithStats((mask == value).astype(np.uint8), connectivity=4)
         if count > 1:

@@ -1,4 +1,4 @@
-"""Lifts 2D masks to one mask value per Gaussian.
+"""Lifting of 2D masks to one mask value per Gaussian.
 
 A view's mask m is modelled as the blend W f of the values f. The closed form is the weighted average W^T m / W^T 1
 (FlashSplat, ECCV 2024, for one bit; Splat Feature Solver, ICLR 2026, for any feature). The paper's method
@@ -18,15 +18,15 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.rendering import RenderOptions, ViewOperator, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
-_SEEN = 1e-3  # sum of blending weights over all pixels of all views, pixels, above which a Gaussian counts as seen
+_SEEN = 1e-3  # sum of blending weights over all views, pixels, above which a Gaussian counts as seen
 
 
 @dataclass(frozen=True)
 class LiftOptions:
-    """How masks become a value per Gaussian."""
+    """Method of lifting, and settings of the paper's training."""
 
     method: Literal["closed_form", "bce"] = "closed_form"
-    """The weighted average, or the paper's training, which starts from the weighted average."""
+    """Weighted average, or the paper's training, which starts from the weighted average."""
     iterations: int = 10_000
     """Steps of `bce`, one view each."""
     learning_rate: float = 0.05
@@ -45,9 +45,8 @@ def lift_masks(
 ) -> Float[Tensor, "n"]:
     """Lift masks of images to one number per Gaussian, its share in the masked object.
 
-    `closed_form` computes the share of the Gaussian's blending weight that falls inside the masks; only Gaussians at
-    the outline of the object have less than 1. `bce` trains a logit per Gaussian (paper, Sec. 4) and gives
-    its sigmoid. Both are compared with the same threshold, the paper's 0.75.
+    `closed_form` computes the share of the Gaussian's blending weight that falls inside the masks. `bce` trains a logit
+    per Gaussian (paper, Sec. 4) and returns its sigmoid. The paper's threshold of 0.75 applies to both.
 
     Args:
         gaussians: n Gaussians.
@@ -72,7 +71,7 @@ def lift_masks(
             )
         operator = view_operator(gaussians, camera, RenderOptions())
         total += weight_inside(operator, mask.to(gaussians.device))
-        if options.method == "bce":  # else one view's tile lists at a time: memory does not grow with the views
+        if options.method == "bce":  # the closed form keeps one operator at a time to save memory
             operators.append(operator)
     progress(len(masks), len(masks), "lifting masks")
     share = share_inside(total)
@@ -82,12 +81,12 @@ def lift_masks(
 
 
 def weight_inside(operator: ViewOperator, mask: Float[Tensor, "h w"]) -> Float[Tensor, "n 2"]:
-    """Blending weight of each Gaussian inside the mask and in the whole view, pixels."""
+    """Compute the blending weight of each Gaussian inside the mask and in the whole view, pixels."""
     return operator.blend_transpose(torch.stack([mask, torch.ones_like(mask)], -1))
 
 
 def share_inside(total: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-    """Share of each Gaussian's blending weight, summed over views, that lies inside the masks; 0 where unseen."""
+    """Compute the share of each Gaussian's blending weight inside the masks, given sums over views; 0 if unseen."""
     inside, seen = total[:, 0], total[:, 1]
     return (inside / seen.clamp_min(_SEEN)).clamp(0, 1).where(seen > _SEEN, 0.0)
 

@@ -1,10 +1,12 @@
-"""Where an object is looked for, and the first selection of its Gaussians there.
+"""Region of the object in a scene, and the first selection of its Gaussians.
 
-The region is a 3D box above what carries the object, a table or a wall: guessed around the largest group of surface
-points near the point where the cameras' optical axes meet (least squares), or around the groups that a user pointed at.
-Points that a user gave in pictures are moved to the surface by the rendered depth; each Gaussian of the region then
-belongs to the side, object or background, from which it is reached over the shorter way, where a way over a change of
-colour is longer (geodesic segmentation; Bai and Sapiro 2007, here on the graph of neighbouring Gaussians).
+1. A user's points in pictures are moved to the surface by the rendered depth.
+2. The region is a 3D box above the support, a table or a wall. It encloses the largest group of surface points near the
+   cameras' focus point, or the groups that the user pointed at.
+3. If a user pointed at the object, each Gaussian of the region joins the object or the background, to whichever its
+   path is shorter. Paths across a change of colour are longer (geodesic segmentation, Bai and Sapiro 2007, here on the
+   graph of neighbouring Gaussians).
+
 All constants are set by hand.
 """
 
@@ -29,53 +31,47 @@ from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.rendering import surface_points
 from splatgraft.segmentation.selection import Box
 
-_WHOLE_VIEWS = 0.75  # share of the images that show the sphere around the middle whole
-_FAR_RADIUS = 0.25  # radius of that sphere over the median distance of the cameras, where they show none whole
-_SUPPORT = LevelPlaneOptions(thickness=0.03, inlier_share=0.12)
-"""Plane near the middle: noise of a reconstruction over the distances of a table instead of a room."""
-_WALL = replace(_SUPPORT, tilt_deg=60.0)
-"""A plane whose normal is at most this far from the mean direction to the cameras."""
-_CAMERAS_IN_FRONT = 0.95  # least share of the cameras in front of the support
-_ABOVE_SUPPORT = 1.5  # least height of a point above the support, over the support's thickness
-_NEAR_SUPPORT = -3.0
-"""Height over the support's thickness from which the pictures decide whether a point is the object's: a support that is
-found too high takes no foot."""
-_MIN_POINTS = 20  # fewer points give a cube around the middle
+_WHOLE_VIEWS = 0.75  # share of the images that show the whole sphere around the middle
+_FAR_RADIUS = 0.25  # radius of that sphere over the cameras' median distance, if they show no whole sphere
+_SUPPORT = LevelPlaneOptions(thickness=0.03, inlier_share=0.12)  # noise of a reconstruction at a table's scale
+_WALL = replace(_SUPPORT, tilt_deg=60.0)  # largest angle between a wall's normal and the mean direction to the cameras
+_CAMERAS_IN_FRONT = 0.95  # smallest share of the cameras in front of the support
+_ABOVE_SUPPORT = 1.5  # smallest height of the object's points above the support, over the support's thickness
+_NEAR_SUPPORT = -3.0  # smallest height allowed if the pictures say object; keeps the foot if the support is too high
+_MIN_POINTS = 20  # fewest points of a group; otherwise the region is a cube around the middle
 _CUBE = 0.5  # half the edge of that cube, over the sphere's radius
-_SPHERES = (1.0, 1.5, 2.0, 3.0)
-"""Radii in which the group is looked for, over that of the sphere, until one holds all of it."""
-_RIM = 0.05  # outermost part of a sphere whose points may go on beyond it, over its radius
-_GROUP_STEP = 0.15  # largest distance between neighbours of one group of points, over the sphere's radius
-_MAX_POINTS = 20_000  # points that are grouped; of more, as many are drawn
-_TRIM = 0.01  # share of points beyond either end of the box along each axis
-_MARGIN = 0.2  # added at each end, over the longest edge: parts without texture have no points
-_REACH = 0.1  # largest distance of a Gaussian of the object from the group of points, over the box's longest edge
-_BEYOND = 1.2  # edges of the box that nothing of the object lies beyond, over those of the box
-_LEVEL_NORMAL_Z = 0.99  # least z of the support's normal at which the box ends above the support
-_MIN_OPACITY = 0.3  # opacity above which a Gaussian is a surface point
-_COLOR_STEP = 2.0
-"""Difference of colour at which a way is twice as long, over the median one of neighbours: texture and noise."""
-_NEIGHBOURS = 10  # nearest Gaussians to which a way leads
-_TOUCHED = 6  # gaussians nearest to a point that the user gave which have its side for certain
+_SPHERES = (1.0, 1.5, 2.0, 3.0)  # search radii over the sphere's, in turn until one contains the whole group
+_RIM = 0.05  # width of the outer rim of a search sphere, over its radius; a group that reaches it may continue
+_GROUP_STEP = 0.15  # largest distance between neighbours in a group of points, over the sphere's radius
+_MAX_POINTS = 20_000  # most points that are grouped; drawn at random from more
+_TRIM = 0.01  # share of points outside the box at either end of each axis
+_MARGIN = 0.2  # margin at each end, over the longest edge: parts without texture have no points
+_REACH = 0.1  # largest distance of the object's Gaussians from the group of points, over the box's longest edge
+_BEYOND = 1.2  # factor on the box's edges that contains all of the object
+_LEVEL_NORMAL_Z = 0.99  # smallest z of the support's normal at which the box ends above the support
+_MIN_OPACITY = 0.3  # smallest opacity of a surface Gaussian
+_COLOR_STEP = 2.0  # colour difference that doubles a path's length, over the median of neighbours (texture, noise)
+_NEIGHBOURS = 10  # nearest Gaussians to which paths lead
+_TOUCHED = 6  # Gaussians nearest to a user's point, which certainly belong to its side
 
 
 @dataclass(frozen=True)
 class ObjectRegion:
-    """A box, without what lies on or below the support."""
+    """Region of the object: a box, its support, and the object's surface points."""
 
     box: Box
-    """Contains the object, world units."""
+    """Box around the object, world units."""
     support: LevelPlane | None
-    """The surface that carries the object; None where none is clear."""
+    """Surface that carries the object; None if none is clear."""
     reason: str
-    """How the box was found, for messages."""
+    """Origin of the box, for messages."""
     is_whole: bool = True
-    """False where the surface points that were found go on beyond the box."""
+    """Whether the group of surface points ends inside the box."""
     group: Float[Tensor, "k 3"] | None = None
-    """Surface points that belong together and are likely the object's; None where the box says it all."""
+    """Connected surface points that are probably the object's; None if there is only the box."""
 
     def contains(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        """Which points lie in the box, above the support, and near the group: what else is in the box is not it."""
+        """Test which points lie in the box, above the support, and near the group of surface points."""
         inside = self.box.contains(points) & _above(points, self.support, _ABOVE_SUPPORT)
         if self.group is None:
             return inside
@@ -84,7 +80,7 @@ class ObjectRegion:
         return inside & torch.from_numpy(np.isfinite(apart)).to(inside.device)
 
     def allows(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        """Which points may be the object's, as the pictures say: not far below the support, nor far from the box."""
+        """Test which points the pictures may add to the object: not far below the support, nor far from the box."""
         inside = _above(points, self.support, _NEAR_SUPPORT)
         return inside & self.box.grown(_BEYOND).contains(points) if self.is_whole else inside
 
@@ -97,14 +93,17 @@ def seed_selection(
     prompts: Mapping[int, ViewPrompt] | None = None,
     known: Bool[Tensor, "n"] | None = None,
 ) -> tuple[Bool[Tensor, "n"], ObjectRegion]:
-    """Select the Gaussians that are likely the object's, and tell the region in which they were looked for.
+    """Select the Gaussians that probably belong to the object, and return them with the region of the search.
 
     Args:
         scene: n Gaussians.
         cameras: Cameras of the capture, on the device of `scene`.
-        box: Around the object, world units; guessed where None.
-        prompts: What the user says, by index of the camera, pixels of its picture.
-        known: Gaussians that masks of some pictures give to the object; None where there are no masks.
+        box: Box around the object, world units; None estimates it.
+        prompts: The user's points and rectangles by index of the camera, pixels of its picture.
+        known: Gaussians that the masks of some pictures assign to the object; None without masks.
+
+    Raises:
+        ValueError: The region has no solid Gaussian.
     """
     prompts = prompts or {}
     opaque = scene.opacities > _MIN_OPACITY
@@ -129,9 +128,9 @@ def seed_selection(
 
 
 def default_box(capture: PosedImages) -> Box:
-    """A box around the object that a capture goes round, from its cameras and sparse points alone.
+    """Estimate a box around the object of a capture from cameras and sparse points.
 
-    Without points it is a cube where the optical axes meet.
+    Without points, the box is a cube around the focus point of the cameras.
     """
     return guess_region(capture.cameras, capture.points).box
 
@@ -139,7 +138,13 @@ def default_box(capture: PosedImages) -> Box:
 def guess_region(
     cameras: Cameras, points: Float[Tensor, "m 3"], pointed_at: Float[Tensor, "k 3"] | None = None
 ) -> ObjectRegion:
-    """The region of the object that the cameras look at, or that a user pointed at, in surface points, world units."""
+    """Estimate the region of the object that the cameras look at, or that a user pointed at.
+
+    Args:
+        cameras: Cameras of the capture.
+        points: Surface points, world units.
+        pointed_at: Surface points on the object, world units; None takes the cameras' focus point.
+    """
     middle = focus_point(cameras) if pointed_at is None else pointed_at.median(0).values.to(cameras.centers)
     source = "the cameras look at" if pointed_at is None else "the points name"
     points = _drawn(points.to(middle))
@@ -150,25 +155,25 @@ def guess_region(
     support = _find_support(cameras, points, middle, radius)
     found = _find_group(points, middle, radius, support, pointed_at)
     if found is not None and found[1] > radius:
-        # the support again, of a sphere as large as the group: a small part of a plane says little of its tilt
+        # find the support again in a sphere as large as the group: a small part of a plane does not determine its tilt
         support = _find_support(cameras, points, middle, found[1])
         found = _find_group(points, middle, radius, support, pointed_at)
     if found is None:
         half = _CUBE * radius
-        why = f"a cube where {source} one place, as hardly any surface points are known there"
+        why = f"a cube where {source} one place, because hardly any surface points are known there"
         return ObjectRegion(Box(middle - half, middle + half), support, why)
     group, _, is_whole = found
     lower, upper = group.quantile(torch.tensor([_TRIM, 1 - _TRIM]).to(group), 0)
     margin = _MARGIN * (upper - lower).max() + 1e-6
     lower, upper = lower - margin, upper + margin
     if support is not None and float(support.normal[2]) > _LEVEL_NORMAL_Z:
-        # the support stays outside, also where the box is used without the plane
+        # the box excludes the support, because it may be used without the plane
         lower[2] = torch.maximum(lower[2], torch.as_tensor(support.offset + support.thickness).to(lower))
     return ObjectRegion(Box(lower, upper), support, f"the group of surface points that {source}", is_whole, group)
 
 
 def region_of_box(cameras: Cameras, points: Float[Tensor, "m 3"], box: Box) -> ObjectRegion:
-    """The region of a box that a user gave, without the support that it may cut."""
+    """Return the region of a user's box, with the support that the box may intersect."""
     middle, radius = (box.lower + box.upper) / 2, 0.75 * float((box.upper - box.lower).norm())
     support = _find_support(cameras, _drawn(points), middle, radius)
     if support is not None:
@@ -182,9 +187,9 @@ def region_of_box(cameras: Cameras, points: Float[Tensor, "m 3"], box: Box) -> O
 def _find_support(
     cameras: Cameras, points: Float[Tensor, "m 3"], middle: Float[Tensor, "3"], radius: float
 ) -> LevelPlane | None:
-    """The largest plane near `middle` on which an object there can stand or hang; None where none is clear.
+    """Find the largest plane near `middle` that can carry the object: a level one, else a wall that faces the cameras.
 
-    A level plane comes first, a table; then one that faces the cameras, a wall. All cameras are in front of it.
+    Nearly all cameras must be in front of the plane. None if no plane is clear.
     """
     near = points[(points - middle.to(points)).norm(dim=1) < radius]
     towards = torch.nn.functional.normalize((cameras.centers - middle.to(cameras.centers)).mean(0), dim=0)
@@ -205,7 +210,7 @@ def _drawn(points: Float[Tensor, "m 3"]) -> Float[Tensor, "k 3"]:
 
 
 def _visible_radius(cameras: Cameras, middle: Float[Tensor, "3"]) -> float:
-    """Radius of the largest sphere around `middle` that most of the images show whole."""
+    """Compute the radius of the largest sphere around `middle` that lies inside most of the images."""
     local = (cameras.camera_from_world[:, :3, :3] @ middle + cameras.camera_from_world[:, :3, 3])[:, :, None]
     pixel = (cameras.intrinsics @ local)[:, :, 0]
     pixel, depth = pixel[:, :2] / pixel[:, 2:], pixel[:, 2]
@@ -217,7 +222,7 @@ def _visible_radius(cameras: Cameras, middle: Float[Tensor, "3"]) -> float:
 
 
 def _above(points: Float[Tensor, "*n 3"], support: LevelPlane | None, thicknesses: float) -> Bool[Tensor, "*n"]:
-    """Which points lie more than so many thicknesses of the support above it; all where there is none."""
+    """Test which points are higher above the support than a multiple of its thickness; all without a support."""
     if support is None:
         return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
     return support.height(points) > thicknesses * support.thickness
@@ -230,10 +235,13 @@ def _find_group(
     support: LevelPlane | None,
     pointed_at: Float[Tensor, "k 3"] | None,
 ) -> tuple[Float[Tensor, "p 3"], float, bool] | None:
-    """The group of points around the middle and above the support, from the smallest sphere that holds all of it.
+    """Find the group of points around the middle and above the support.
 
-    With the radius of the sphere, and whether the points end within it; where no sphere holds all of it, the group of
-    the smallest sphere. None where hardly any points are known.
+    The search takes growing spheres until one contains the whole group. If none does, the group is that of the smallest
+    sphere.
+
+    Returns:
+        The group, the radius of its sphere, and whether the group ends inside it; None if hardly any points are known.
     """
     points, first = points[_above(points, support, _ABOVE_SUPPORT)], None
     for factor in _SPHERES:
@@ -252,7 +260,10 @@ def _find_group(
 def _connected(
     points: Float[Tensor, "m 3"], reach: float, pointed_at: Float[Tensor, "k 3"] | None, middle: Float[Tensor, "3"]
 ) -> Bool[Tensor, "m"]:
-    """The set of points connected by distances below `reach` that counts most near `middle`, or was pointed at."""
+    """Select the connected components that were pointed at, or the one with most weight near `middle`.
+
+    Points closer than `reach` are connected.
+    """
     tree = KDTree(points.cpu().numpy())
     pairs = tree.query_pairs(reach, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
@@ -268,7 +279,7 @@ def _connected(
 def _points_on_surface(
     scene: Gaussians, cameras: Cameras, prompts: Mapping[int, ViewPrompt], which: str
 ) -> Float[Tensor, "k 3"]:
-    """The points `inside` or `outside` on the surface that their picture shows; a rectangle alone gives its centre."""
+    """Move the user's points `inside` or `outside` to the surface; a rectangle without points gives its centre."""
     found = [torch.zeros(0, 3, device=scene.device)]
     for index, prompt in prompts.items():
         pixels = prompt.inside if which == "inside" else prompt.outside
@@ -281,7 +292,7 @@ def _points_on_surface(
 
 
 def _framed(points: Float[Tensor, "n 3"], cameras: Cameras, prompts: Mapping[int, ViewPrompt]) -> Bool[Tensor, "n"]:
-    """Which points lie in the user's rectangle in every picture that has one."""
+    """Test which points lie in the user's rectangle in every picture that has one."""
     inside = torch.ones(len(points), dtype=torch.bool, device=points.device)
     for index, prompt in prompts.items():
         if prompt.box is not None:
@@ -294,7 +305,10 @@ def _framed(points: Float[Tensor, "n 3"], cameras: Cameras, prompts: Mapping[int
 def _nearer_inside(
     scene: Gaussians, region: ObjectRegion, inside: Float[Tensor, "k 3"], outside: Float[Tensor, "m 3"]
 ) -> Bool[Tensor, "n"]:
-    """Which Gaussians are nearer to the points on the object than to those beside it and to the region's outside."""
+    """Test which Gaussians have a shorter path to the points on the object than to the background.
+
+    The background is the points outside and everything beyond the region.
+    """
     around = torch.nonzero(region.box.grown(1.5).contains(scene.means)).flatten()
     near = scene.select(around)
     means = near.means.detach().double().cpu().numpy()
@@ -312,13 +326,13 @@ def _nearer_inside(
     def touched(points: Tensor) -> np.ndarray:
         return np.unique(np.asarray(tree.query(points.reshape(-1, 3).cpu().numpy(), k=_TOUCHED)[1]))
 
-    def way_from(sources: np.ndarray) -> np.ndarray:
+    def path_from(sources: np.ndarray) -> np.ndarray:
         if not len(sources):
             return np.full(len(means), np.inf)
         return dijkstra(graph, directed=False, indices=sources, min_only=True)
 
     beyond = np.flatnonzero(~region.contains(near.means).cpu().numpy())
-    from_object, from_rest = way_from(touched(inside)), way_from(np.union1d(touched(outside), beyond))
+    from_object, from_rest = path_from(touched(inside)), path_from(np.union1d(touched(outside), beyond))
     chosen = torch.zeros(scene.count, dtype=torch.bool, device=scene.device)
     nearer = (from_object <= from_rest) & np.isfinite(from_object)
     chosen[around] = torch.from_numpy(nearer).to(scene.device)

@@ -1,11 +1,13 @@
-"""Object masks by networks in .onnx files, run by onnxruntime: BiRefNet of single images, SAM 2 guided by prompts.
+"""Object masks by BiRefNet and SAM 2, networks in .onnx files that onnxruntime runs.
 
-BiRefNet (Zheng et al. 2024) finds the foreground. SAM 2 (Ravi et al. 2024) is two networks with the interface of its
-public exports (samexporter's export_sam2.py, on the hub as vietanhdev/segment-anything-2-onnx-models): the encoder
-takes `image` and gives `image_embed`, `high_res_feats_0`, `high_res_feats_1`; the decoder takes these, `point_coords`
-in pixels of the encoder's picture, `point_labels` (0 beside the object, 1 on it, 2 and 3 corners of a box),
-`mask_input`, `has_mask_input`, and gives `masks` (logits) and `iou_predictions`. Some decoders also take
-`orig_im_size`.
+BiRefNet (Zheng et al. 2024) finds the foreground of an image. SAM 2 (Ravi et al. 2024) finds the object at points or in
+a box. Its two networks have the interface of its public exports (samexporter's export_sam2.py, on the hub as
+vietanhdev/segment-anything-2-onnx-models):
+
+- Encoder: takes `image`, returns `image_embed`, `high_res_feats_0` and `high_res_feats_1`.
+- Decoder: takes these, `point_coords` in pixels of the encoder's picture, `point_labels` (0 background, 1 object, 2 and
+  3 corners of a box), `mask_input`, `has_mask_input`, in some exports also `orig_im_size`. It returns `masks` (logits)
+  and `iou_predictions`.
 """
 
 import os
@@ -26,38 +28,36 @@ from splatgraft.runtime.hub import REPOSITORIES, hub_file
 
 BIREFNET_REPOSITORY = REPOSITORIES["birefnet"]
 _BIREFNET_FILE = "onnx/model.onnx"
-_BIREFNET_SIDE = 1024
-"""Width and height, pixels, at which BiRefNet was trained; taken where the network leaves its side free."""
+_BIREFNET_SIDE = 1024  # width and height at which BiRefNet was trained, for networks of variable size
 _SAM2_FEATURES = ("image_embed", "high_res_feats_0", "high_res_feats_1")
 _SAM2_PROMPTS = ("point_coords", "point_labels", "mask_input", "has_mask_input")
 _SAM2_MASK_STRIDE = 4  # side of the encoder's picture over that of `mask_input`
 _SAM2_MARGIN = 0.05  # added around the box of the 3D selection at each side, over its width and height; set by hand
-_IMAGENET_MEAN = torch.tensor([0.485, 0.456, 0.406])
+_IMAGENET_MEAN = torch.tensor([0.485, 0.456, 0.406])  # the networks' normalisation of sRGB in [0, 1]
 _IMAGENET_STD = torch.tensor([0.229, 0.224, 0.225])
-"""Mean and deviation of sRGB in [0, 1] with which the networks were trained."""
 _CUDA = "CUDAExecutionProvider"
 
 
 @dataclass(frozen=True)
 class BiRefNet:
-    """A loaded network that finds the foreground of images."""
+    """A loaded BiRefNet, which finds the foreground of images."""
 
     session: Any
-    """An onnxruntime.InferenceSession with one input (1, 3, side, side) and logits or probabilities out."""
+    """onnxruntime.InferenceSession with one input (1, 3, side, side) that returns logits or probabilities."""
     side: int
     """Width and height of the network's input, pixels."""
 
     @property
     def place(self) -> str:
-        """Where it computes, for messages."""
-        # it may not compute on CUDA, though asked, where CUDA's libraries are missing
+        """Device of the computation, for messages."""
+        # without CUDA's libraries, onnxruntime uses the CPU although CUDA was requested
         on_cuda = self.session.get_providers()[0] == _CUDA
         return "CUDA" if on_cuda else f"{self.session.get_session_options().intra_op_num_threads} cores"
 
     def mask(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-        """Share of each pixel that is foreground, in [0, 1]."""
+        """Compute the foreground share of each pixel, in [0, 1]."""
         square = _square(image, self.side)[None].numpy()
-        # the last output is the finest where a network gives several
+        # if a network has several outputs, the last is the finest
         made = self.session.run(None, {self.session.get_inputs()[0].name: square})[-1]
         made = torch.from_numpy(np.asarray(made, np.float32))
         found = made.reshape(made.shape[-2:])
@@ -70,16 +70,16 @@ class Sam2:
     """A loaded SAM 2: an encoder of pictures and a decoder of prompts."""
 
     encoder: Any
-    """An onnxruntime.InferenceSession."""
+    """Encoder of pictures, an onnxruntime.InferenceSession."""
     decoder: Any
-    """An onnxruntime.InferenceSession."""
+    """Decoder of prompts, an onnxruntime.InferenceSession."""
     side: int
     """Width and height of the encoder's picture, pixels."""
 
     def cut(
         self, image: Float[Tensor, "h w 3"], lifted: Float[Tensor, "h w"], prompt: ViewPrompt
     ) -> Float[Tensor, "h w"]:
-        """The object's mask, 0 or 1: of the networks' proposals the one that they predict to be the best."""
+        """Cut the object out of one picture: the proposed mask, 0 or 1, with the highest predicted IoU."""
         height, width = image.shape[:2]
         names = [output.name for output in self.encoder.get_outputs()]
         given = {self.encoder.get_inputs()[0].name: _square(image, self.side)[None].numpy()}
@@ -104,23 +104,35 @@ class Sam2:
 
 
 def load_birefnet(weights: Path | str = BIREFNET_REPOSITORY, *, threads: int | None = None) -> BiRefNet:
-    """Load the network.
+    """Load BiRefNet.
 
     Args:
         weights: An .onnx file, or a repository on the Hugging Face hub, downloaded once; none of its code runs.
-        threads: CPU threads, where it runs on the CPU; all cores that this process may use where not given.
+        threads: CPU threads; by default one for each core that this process may use.
+
+    Raises:
+        ValueError: A package or file is missing, or the file is not such a network.
     """
     path = weights if isinstance(weights, Path) else _from_hub(weights)
     session = _opened(path, "birefnet", threads)
     shape = session.get_inputs()[0].shape
     if len(shape) != 4 or shape[1] not in (3, "channels", "num_channels"):
         raise ValueError(f"{path}: expected an input of shape (1, 3, side, side), found {shape}")
-    # a free side is written as a name
+    # a variable side is written as a name
     return BiRefNet(session, shape[2] if isinstance(shape[2], int) else _BIREFNET_SIDE)
 
 
 def load_sam2(encoder: Path, decoder: Path, *, threads: int | None = None) -> Sam2:
-    """Load the .onnx files of an image encoder and its prompt decoder, for so many CPU threads (by default all)."""
+    """Load SAM 2 from the .onnx files of its image encoder and prompt decoder.
+
+    Args:
+        encoder: File of the encoder.
+        decoder: File of the decoder.
+        threads: CPU threads; by default one for each core that this process may use.
+
+    Raises:
+        ValueError: A package or file is missing, or the networks have other inputs or outputs.
+    """
     encodes, decodes = (_opened(path, "sam2", threads) for path in (encoder, decoder))
     shape = encodes.get_inputs()[0].shape
     if len(shape) != 4 or shape[1] != 3 or not isinstance(shape[2], int) or shape[2] != shape[3]:
@@ -139,14 +151,14 @@ def load_sam2(encoder: Path, decoder: Path, *, threads: int | None = None) -> Sa
 
 
 def _square(image: Float[Tensor, "h w 3"], side: int) -> Float[Tensor, "3 s s"]:
-    """The image as the networks see it."""
+    """Resize and normalise an image for the networks."""
     return ((resize(image, side, side) - _IMAGENET_MEAN) / _IMAGENET_STD).permute(2, 0, 1).contiguous()
 
 
 def _points(
     shown: Bool[np.ndarray, "h w"], prompt: ViewPrompt
 ) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k"]]:
-    """Points and labels, pixels of the picture: what the user says, else the 3D selection's box and middle."""
+    """Return points (pixels) and labels: the user's, completed by the 3D selection's innermost point and box."""
     inside, box = prompt.inside.numpy(), prompt.box
     if shown.any():
         if not len(inside):
@@ -173,7 +185,7 @@ def _from_hub(repository: str) -> Path:
 
 
 def _opened(path: Path, method: str, threads: int | None) -> Any:
-    """An InferenceSession on CUDA where onnxruntime has it (the package onnxruntime-gpu), else on the CPU."""
+    """Open an InferenceSession on CUDA if onnxruntime supports it (the package onnxruntime-gpu), else on the CPU."""
     _require("onnxruntime", method)
     import onnxruntime
 

@@ -1,4 +1,4 @@
-"""Segmentation of a scene by the object masks of its capture: lifted to the Gaussians, selected, made solid, closed."""
+"""Segmentation of a scene into an object and its surroundings, by the object masks of the scene's capture."""
 
 from dataclasses import dataclass
 
@@ -20,15 +20,15 @@ class Segmentation:
     """A scene of n Gaussians divided into an object and its surroundings."""
 
     object: Gaussians
-    """The object's Gaussians, made solid where that was asked for, and closed where no photograph shows it."""
+    """The object's Gaussians, made solid if asked for, and closed on the unseen side."""
     surroundings: Gaussians
     """All other Gaussians of the scene, unchanged."""
     selection: Bool[Tensor, "n"]
-    """Which Gaussians of the scene are the object's."""
+    """Whether a Gaussian of the scene belongs to the object."""
     feature: Float[Tensor, "n"]
-    """Share of each Gaussian's blending weight that falls inside the masks, in [0, 1]."""
+    """Share of each Gaussian's blending weight inside the masks, in [0, 1]."""
     is_guessed: Bool[Tensor, "k"]
-    """Which Gaussians of the object close its unseen side."""
+    """Whether a Gaussian of the object closes its unseen side."""
 
 
 def segment(
@@ -42,17 +42,21 @@ def segment(
 ) -> Segmentation:
     """Divide a scene into the object that the masks of its capture show and everything else.
 
-    Lifts the masks (`lift_masks`), selects Gaussians by threshold, box and connected piece (`select_object`), fits the
-    object alone to its masked images, so that it is opaque without its surroundings (`solidify_object`), and closes the
-    side that none of them shows (`close_unseen_side`).
+    1. Lift the masks to the Gaussians (`lift_masks`).
+    2. Select Gaussians by threshold, box and connected component (`select_object`).
+    3. Fit the object alone to its masked images, so that it is opaque without its surroundings (`solidify_object`).
+    4. Close the side that no image shows (`close_unseen_side`).
 
     Args:
         scene: n Gaussians reconstructed from `capture`.
         capture: The capture with object masks; views without a mask are not used.
-        lift: How masks become a number per Gaussian.
-        select: Which Gaussians are the object.
-        solidify: Length and rates of the fit of the object alone; None leaves its Gaussians as they are in the scene.
+        lift: Method of lifting the masks.
+        select: Criteria for the object's Gaussians.
+        solidify: Length and detail of the fit of the object alone; None keeps its Gaussians unchanged.
         progress: Called with steps done, steps in all and a short text.
+
+    Raises:
+        ValueError: The capture has no masks, or no Gaussian meets the criteria.
     """
     masked = capture.with_masks()
     if len(masked) == 0:

@@ -1,4 +1,4 @@
-"""Selects the Gaussians of an object: by mask value, 3D box and connected component, and as the user corrects it."""
+"""Selection of an object's Gaussians by mask value, 3D box, connected component and the user's corrections."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -15,30 +15,30 @@ from splatgraft.core.gaussians import Gaussians
 
 Keep = Literal["substantial", "largest", "all"]
 
-_SUBSTANTIAL = 0.05  # least summed opacity of a substantial component over the largest one's; set by hand
+_SUBSTANTIAL = 0.05  # smallest summed opacity of a substantial component, over the largest one's; set by hand
 _NEIGHBOURS = 16  # nearest Gaussians that are tested for contact with each Gaussian
 
 
 @dataclass(frozen=True)
 class Box:
-    """All points between two corners."""
+    """Axis-aligned box."""
 
     lower: Float[Tensor, "3"]
-    """Least x, y, z, world units."""
+    """Smallest x, y, z, world units."""
     upper: Float[Tensor, "3"]
-    """Greatest x, y, z, world units."""
+    """Largest x, y, z, world units."""
 
     def __post_init__(self) -> None:
-        """Raises: ValueError where the corners are not in order."""
+        """Raise a ValueError if the corners are not in order."""
         if not bool((self.lower < self.upper).all()):
             raise ValueError(f"box: expected lower < upper, found {self.lower.tolist()} and {self.upper.tolist()}")
 
     def contains(self, points: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
-        """Which points lie inside."""
+        """Test which points lie inside."""
         return ((points >= self.lower.to(points)) & (points <= self.upper.to(points))).all(-1)
 
     def grown(self, factor: float) -> "Box":
-        """The box with edges `factor` times as long and the same centre."""
+        """Scale the edges by `factor` around the centre."""
         centre, half = (self.lower + self.upper) / 2, (self.upper - self.lower) / 2 * factor
         return Box(centre - half, centre + half)
 
@@ -51,26 +51,26 @@ class Box:
 
 @dataclass(frozen=True)
 class SelectOptions:
-    """What makes a Gaussian part of the object."""
+    """Criteria for the object's Gaussians."""
 
     threshold: float = 0.75
-    """Least feature (paper, Sec. 4: 0.75 after the sigmoid)."""
+    """Smallest feature (paper, Sec. 4: 0.75 after the sigmoid)."""
     box: Box | None = None
-    """Where centres must lie, world units."""
+    """Box that must contain the centres, world units; None: no box."""
     keep: Keep = "substantial"
-    """Which connected components stay: those of at least a twentieth of the largest one's summed opacity, the largest
+    """Connected components that stay: those with at least a twentieth of the largest one's summed opacity, the largest
     one, or all."""
 
 
 def select_object(
     gaussians: Gaussians, feature: Float[Tensor, "n"], options: SelectOptions = SelectOptions()
 ) -> Bool[Tensor, "n"]:
-    """Select the Gaussians of the object by threshold, box and connected piece.
+    """Select the Gaussians of the object by threshold, box and connected component.
 
     Args:
         gaussians: n Gaussians of the scene.
-        feature: Share of each in the object, in [0, 1], as `lift_masks` gives it.
-        options: Threshold, box, and which connected pieces stay.
+        feature: Share of each Gaussian in the object, in [0, 1] (see `lift_masks`).
+        options: Threshold, box and connected components that stay.
 
     Returns:
         True for the object's Gaussians.
@@ -98,7 +98,7 @@ def select_object(
 
 
 def _component_opacity(gaussians: Gaussians) -> Float[Tensor, "n"]:
-    """For each Gaussian the sum of opacities of its connected component; two touch if their 2-sigma spheres do."""
+    """Compute, for each Gaussian, the summed opacity of its connected component; 2-sigma spheres must touch."""
     n = gaussians.count
     if n == 1:
         return gaussians.opacities.detach()
@@ -116,13 +116,13 @@ def _component_opacity(gaussians: Gaussians) -> Float[Tensor, "n"]:
 
 
 def apply_corrections(lifted: Bool[Tensor, "n"], corrections: Int8[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
-    """The selection from the masks with the user's corrections: 1 adds a Gaussian, -1 removes it, 0 leaves it."""
+    """Apply the user's corrections to the selection from the masks: 1 adds a Gaussian, -1 removes it, 0 keeps it."""
     if corrections is None:
         return lifted
     if len(corrections) != len(lifted):
         raise ValueError(
             f"corrections: expected one for each of {len(lifted)} Gaussians, found {len(corrections)}; "
-            "the scene is another one now"
+            "the scene has changed since"
         )
     corrections = corrections.to(lifted.device)
     return (lifted | (corrections > 0)) & ~(corrections < 0)
@@ -131,6 +131,6 @@ def apply_corrections(lifted: Bool[Tensor, "n"], corrections: Int8[Tensor, "n"] 
 def add_correction(
     corrections: Int8[Tensor, "n"] | None, touched: Bool[Tensor, "n"], *, add: bool
 ) -> Int8[Tensor, "n"]:
-    """The corrections after one more stroke over the `touched` Gaussians; the last stroke over a Gaussian counts."""
+    """Add a stroke over the `touched` Gaussians to the corrections; the last stroke over a Gaussian counts."""
     before = torch.zeros(len(touched), dtype=torch.int8) if corrections is None else corrections
     return torch.where(touched, torch.tensor(1 if add else -1, dtype=torch.int8), before)

@@ -1,11 +1,15 @@
-"""Makes an extracted object opaque and fine: fits it alone to its masked photographs over random backgrounds.
+"""Fit of an extracted object, alone, to its masked photographs over random backgrounds.
 
-In its own capture an object may be half transparent, or stick out of its outline, and still look right before what was
-fitted with it. Only an opaque object inside its mask matches the photographs over every background. All pixels and all
-Gaussians of this fit are the object's, so that the capture itself needs to be no more than a draft (docs/results.md).
+In its own capture, an object that is half transparent or larger than its outline can look right in front of the scene
+that was fitted with it. Only an opaque object inside its mask matches the photographs over every background. All pixels
+and Gaussians of this fit belong to the object, so a draft of the capture is enough (docs/results.md).
 
-Where the object has fewer Gaussians than its size in the photographs asks for, some are split, as in a reconstruction.
-What no photograph shows gets the colours of what is next to it. All constants are set by hand.
+1. Each view is cropped to the object. Pixels in which something else hides the object are not compared.
+2. The object is fitted. If it has few Gaussians for its size in the photographs, Gaussians are split as in a
+   reconstruction.
+3. Gaussians that hardly show in any view take the mean colour of their neighbours.
+
+All constants are set by hand.
 """
 
 from collections.abc import Sequence
@@ -24,15 +28,12 @@ from splatgraft.fitting.surface_loss import SurfaceLoss
 from splatgraft.rendering import RenderOptions, render, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
-_DENSIFICATIONS = 20  # intervals between which Gaussians are split
-_FULL_AT, _STOP_AT = 0.6, 0.7
-"""Shares of the steps after which the wanted number may be reached, and after which nothing is split or removed."""
-_ERROR_EVERY = 4  # steps between two measurements of the error that each Gaussian covers
-_STRIDE = 2  # every how many pixels along each axis a step fits
-_HIDDEN = 0.1
-"""Pixels in which a Gaussian shows, over the square of its width, below which its colour is not known; over the median
-one."""
-_NEIGHBOURS = 8  # gaussians of known colour whose mean is taken then
+_DENSIFICATIONS = 20  # number of densifications
+_FULL_AT, _STOP_AT = 0.6, 0.7  # shares of the steps at which the number is reached, and after which density is fixed
+_ERROR_EVERY = 4  # steps between measurements of the error that each Gaussian covers
+_STRIDE = 2  # distance of the fitted pixels along each axis
+_HIDDEN = 0.1  # visible pixels over a Gaussian's own area, relative to the median, below which its colour is unknown
+_NEIGHBOURS = 8  # Gaussians of known colour whose mean replaces an unknown one
 _RATES = LearningRates(
     means=1.6e-3,
     means_final=1.6e-5,
@@ -44,9 +45,9 @@ _RATES = LearningRates(
     view_colors=0.003,
     final=0.1,
 )
-"""Learning rates; those of the centres over the object's radius."""
-_OCCLUDER_DISTANCE = 0.25  # distance in front of the object, over its extent, from which something else occludes it
-_MARGIN_PX = 12  # border of the image windows around the object
+"""Learning rates; those of the centres are over the object's radius."""
+_OCCLUDER_DISTANCE = 0.25  # smallest distance of an occluder in front of the object, over the object's extent
+_MARGIN_PX = 12  # margin of a cropped view around the object
 
 
 @dataclass(frozen=True)
@@ -54,21 +55,21 @@ class SolidifyOptions:
     """Length and detail of the fit."""
 
     iterations: int = 1600
-    """Steps, one view each."""
+    """Number of steps, one view each."""
     pixels_per_gaussian: float = 3.0
-    """Pixels of the object in the median view for each Gaussian that it should have; 0 splits none."""
+    """Pixels of the object in the median view per Gaussian after splitting; 0 splits none."""
     budget: int = 50_000
-    """Most Gaussians that it is split to."""
+    """Largest number of Gaussians after splitting."""
     view_gains: Sequence[float] | None = None
-    """Brightness of each photo over their mean, where exposure and white balance differ: they are fitted, and stay out
-    of the object."""
+    """Brightness of each photo over their mean if exposure or white balance differ; colour maps of the photos are then
+    fitted and stay out of the object. None fits no maps."""
     seed: int = 0
     """Seed of the order of views and of the backgrounds."""
 
 
 @dataclass(frozen=True)
 class _ObjectViews:
-    """Views cropped to the object; a step sees every second pixel of one."""
+    """Views cropped to the object; a step fits every second pixel of one."""
 
     views: Sequence[View]
 
@@ -90,11 +91,11 @@ def solidify_object(
 ) -> Gaussians:
     """Fit an extracted object alone to its masked images over random backgrounds, so that it becomes opaque and fine.
 
-    Pixels outside the mask where the object is hidden by something in front of it are not used.
+    Pixels outside the mask in which something in front hides the object are not compared.
 
     Args:
         scene: n Gaussians of the whole scene.
-        selection: Which of them are the object's.
+        selection: True for the object's Gaussians.
         cameras: v cameras, on the device of `scene`.
         photographs: The image (h, w, 3), sRGB in [0, 1], and the object mask (h, w) of each camera.
         options: Steps, detail and seed.
@@ -104,7 +105,7 @@ def solidify_object(
         The object's Gaussians, changed in every field; densified where the images hold more detail than the Gaussians.
 
     Raises:
-        ValueError: No mask shows any of it.
+        ValueError: No mask shows the object.
     """
     chosen = scene.select(selection)
     views, gains = [], []
@@ -140,7 +141,7 @@ def solidify_object(
 
 
 def _density(chosen: Gaussians, views: Sequence[View], cameras: Cameras, options: SolidifyOptions) -> DensityControl:
-    """Splits up to as many Gaussians as the median view asks for."""
+    """Make a density control whose budget follows from the object's size in the median view."""
     pixels = torch.tensor([float((view.mask > 127).sum()) for view in views if view.mask is not None])
     wanted = min(int(float(pixels.median()) / options.pixels_per_gaussian), options.budget)
     return DensityControl(
@@ -155,7 +156,7 @@ def _density(chosen: Gaussians, views: Sequence[View], cameras: Cameras, options
 
 
 def _with_known_colors(gaussians: Gaussians, views: Sequence[View]) -> Gaussians:
-    """The Gaussians that hardly show in any view with the mean colour of the nearest that do, from all sides alike."""
+    """Replace the colours of Gaussians that hardly show in any view by the mean of the nearest visible ones, band 0."""
     shown = torch.zeros(gaussians.count, device=gaussians.device)
     for view in views:
         ones = torch.ones_like(view.image[..., :1], dtype=torch.float32)
@@ -181,7 +182,7 @@ def _cropped_view(
     image: Float[Tensor, "h w 3"],
     mask: Float[Tensor, "h w"],
 ) -> View | None:
-    """The view cropped to where the object shows; None where the mask is empty."""
+    """Crop a view to the object; None if the mask is empty."""
     chosen = scene.select(selection)
     object_alone = render(chosen, camera, outputs=frozenset({"depth"}))
     rest = render(scene.select(~selection), camera, outputs=frozenset({"depth"}))

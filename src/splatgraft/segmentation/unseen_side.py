@@ -1,9 +1,10 @@
-"""Closes the side of an object that no photograph shows: an opaque back, on the hull of its masks.
+"""Closing of the side of an object that no photograph shows, by flat Gaussians on the visual hull of its masks.
 
-The hull is carved out of a grid of voxels by the masks (visual hull; Laurentini 1994): silhouettes from one side give
-the outline from the other, too. Where no camera sees the hull's surface, and the object has no surface behind it, flat
-Gaussians are put there. Their colours continue those at the border of what was seen (Laplace's equation on the
-surface). None of them shows in the photographs.
+1. The masks carve the visual hull out of a grid of voxels (Laurentini 1994); silhouettes from one side also give the
+   outline from the other.
+2. Flat opaque Gaussians are placed on the parts of the hull that no camera sees, unless the object has a surface there.
+3. Their colours continue those at the border of the seen surface (Laplace's equation on the surface).
+4. Gaussians that would show in a photograph are removed.
 """
 
 import math
@@ -25,66 +26,65 @@ from splatgraft.rendering import RenderOptions, view_operator
 
 # all set by hand
 _GRID = 96  # voxels along each axis
-_ROOM = 1.0  # room around the object's Gaussians in which its unseen side may lie, over their extent
-_TRIMMED = 0.005  # share of the Gaussians beyond either end of that extent
-_AGREEING = 0.94  # share of the masks inside of which a voxel of the hull must lie: one of sixteen may be wrong
-_SHOWN = 0.25  # share of the masks that must show a voxel of the hull: close-ups show parts
-_PIECE = 0.02  # share of the object's surface that a piece of the hull must hold: others are only where few masks reach
-_FACING = 0.2  # cosine between a surface's normal and a camera, below which the camera does not see it
-_MAX_VIEWS = 40  # photographs that are asked, spread over the list
-_BIAS = 2.5  # voxels from which on the hull hides a point of its surface
-_OPAQUE = 0.3  # opacity from which a Gaussian is a surface, and has a colour to continue
-_INSET = 2.0  # voxels by which they lie inside of the hull: it is wider than the object where no camera saw its outline
-_OVERLAP = 4.0  # voxels by which they reach under what was seen, so that no gap shows between
-_HIDDEN = 0.005  # share of a Gaussian's area that may show in a photograph
-_RIM_PX = 1  # pixels of a mask's rim in which none of them may lie
-_WIDTH, _THICKNESS = 0.7, 0.15
-"""Standard deviations of the Gaussians, over a voxel's side."""
+_ROOM = 1.0  # margin around the object's Gaussians in which its unseen side may lie, over their extent
+_TRIMMED = 0.005  # share of the Gaussians outside that extent at either end
+_AGREEING = 0.94  # smallest share of masks that contain a voxel of the hull: one of sixteen may be wrong
+_SHOWN = 0.25  # smallest share of photographs that frame a voxel of the hull; close-ups frame only parts
+_PIECE = 0.02  # smallest share of the object's surface in a piece of the hull; other pieces come from too few masks
+_FACING = 0.2  # smallest cosine between a surface's normal and the direction to a camera that sees it
+_MAX_VIEWS = 40  # most photographs that are used, evenly spaced in their order
+_BIAS = 2.5  # voxels between a point of the hull's surface and the hull's first voxel that may hide it
+_OPAQUE = 0.3  # smallest opacity of a surface Gaussian
+_INSET = 2.0  # depth of the new Gaussians inside the hull, voxels; unseen outlines make the hull wider than the object
+_OVERLAP = 4.0  # overlap of the new Gaussians with the seen surface, voxels; closes gaps
+_HIDDEN = 0.005  # largest share of a new Gaussian's area that may show in a photograph
+_RIM_PX = 1  # rim of a mask without new Gaussians
+_WIDTH, _THICKNESS = 0.7, 0.15  # standard deviations of the new Gaussians, over a voxel's side
 _LOGIT = 4.0  # opacity .98
-_UNDERSIDE = -0.3  # height of a normal below which a surface belongs to the underside, which nobody photographs
+_UNDERSIDE = -0.3  # largest upward component of a normal of the underside, which photographs cannot show
 _NEIGHBOURS = 8
-_ROUNDS = 400  # steps of Jacobi's method; a step carries colours one neighbour further
-_LEAST = 0.02  # share of the surface below which an object counts as seen from all sides
+_ROUNDS = 400  # iterations of Jacobi's method; each carries colours one neighbour farther
+_LEAST = 0.02  # unseen share of the surface below which an object counts as seen from all sides
 WIDE_GAP_DEG = 60.0
-"""Turn without photographs from which it is named."""
+"""Horizontal angle without photographs above which a gap is reported."""
 
 
 @dataclass(frozen=True)
 class ClosedObject:
-    """An object whose unseen side is closed."""
+    """An object with a closed unseen side."""
 
     gaussians: Gaussians
-    """Those of the object, unchanged, then those of its unseen side."""
+    """Gaussians of the object, unchanged, followed by those of its unseen side."""
     is_guessed: Bool[Tensor, "n"]
-    """Which are of the unseen side."""
+    """Whether a Gaussian belongs to the unseen side."""
     guessed_share: float
-    """Share of the object's surface that no photograph shows, without its underside, in [0, 1]."""
+    """Unseen share of the object's surface without its underside, in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class _Hull:
-    """Voxels of an object and m points on their surface."""
+    """Voxels of the visual hull and m points on its surface."""
 
     occupied: Bool[Tensor, "g g g"]
     low: Float[Tensor, "3"]
-    """Corner of the grid."""
+    """Lower corner of the grid, world units."""
     voxel: Float[Tensor, "3"]
     """Sides of a voxel, world units."""
     points: Float[Tensor, "m 3"]
     normals: Float[Tensor, "m 3"]
-    """Unit, outwards."""
+    """Outward unit normals."""
 
 
 def close_unseen_side(object_: Gaussians, cameras: Cameras, masks: Sequence[Float[Tensor, "_ _"]]) -> ClosedObject:
-    """Close the side of an object that no photograph shows, its underside included.
+    """Close the side of an object that no photograph shows, including its underside.
 
     Args:
         object_: The object's Gaussians.
-        cameras: Of the photographs with masks.
-        masks: White where the object is, one per camera, at its size.
+        cameras: Cameras of the photographs with masks.
+        masks: Masks of the object, 1 inside, one per camera at its size.
 
     Returns:
-        On the CPU; the object as it was where all of it was seen, and where its masks have no common hull.
+        The closed object on the CPU; unchanged if all of it was seen, or if its masks have no common hull.
     """
     object_, cameras = object_.to("cpu"), cameras.to("cpu")
     up = estimate_up(cameras).to(object_.means)
@@ -124,14 +124,14 @@ def close_unseen_side(object_: Gaussians, cameras: Cameras, masks: Sequence[Floa
 
 
 def widest_gap(cameras: Cameras, middle: Float[Tensor, "3"]) -> tuple[float, tuple[str, str]]:
-    """The widest turn about a point, seen from above, from which no photograph was taken.
+    """Find the widest horizontal angle around a point in which no photograph was taken.
 
     Args:
-        cameras: Of the photographs.
-        middle: World units.
+        cameras: Cameras of the photographs.
+        middle: The point, world units.
 
     Returns:
-        Degrees, and the names of the photographs on either side of it.
+        The angle, degrees, and the names of the photographs on either side of it.
     """
     tangent, bitangent = tangents(estimate_up(cameras))
     away = cameras.centers - middle
@@ -148,13 +148,13 @@ def widest_gap(cameras: Cameras, middle: Float[Tensor, "3"]) -> tuple[float, tup
 def _carved(
     object_: Gaussians, cameras: Cameras, masks: Sequence[Float[Tensor, "_ _"]], up: Float[Tensor, "3"]
 ) -> _Hull | None:
-    """The hull of the masks around an object, which ends at the object's lowest level; None where there is none."""
+    """Carve the visual hull of the masks, cut off below the object's lowest point; None if it is empty."""
     ends = object_.means.quantile(torch.tensor([_TRIMMED, 1 - _TRIMMED]), dim=0)
     lowest = float((object_.means @ up).quantile(_TRIMMED))
     room = _ROOM * float((ends[1] - ends[0]).max())
     low, high = ends[0] - room, ends[1] + room
     surface = object_.means[object_.opacities > _OPAQUE]
-    # once for its extent, then finely there
+    # the first pass finds the hull's extent, the second carves it finely
     for _ in range(2):
         voxel = (high - low) / _GRID
         index = torch.arange(_GRID) + 0.5
@@ -178,7 +178,7 @@ def _carved(
 def _pieces_around(
     surface: Float[Tensor, "p 3"], occupied: Bool[Tensor, "g g g"], low: Float[Tensor, "3"], voxel: Float[Tensor, "3"]
 ) -> Bool[Tensor, "g g g"]:
-    """The connected pieces of a hull that hold a part of a surface."""
+    """Select the connected pieces of a hull that contain a part of the object's surface."""
     pieces, count = ndimage.label(occupied.numpy(), ndimage.generate_binary_structure(3, 3))  # pyright: ignore[reportGeneralTypeIssues]
     cells = ((surface - low) / voxel).long()
     x, y, z = cells[((cells >= 0) & (cells < _GRID)).all(1)].unbind(1)
@@ -191,7 +191,7 @@ def _pieces_around(
 def _inside_masks(
     points: Float[Tensor, "p 3"], cameras: Cameras, masks: Sequence[Float[Tensor, "_ _"]]
 ) -> Bool[Tensor, "p"]:
-    """Which points lie inside nearly all masks that could show them."""
+    """Test which points lie inside nearly all masks of the photographs that frame them."""
     inside, shown, left = torch.zeros(len(points)), torch.zeros(len(points)), torch.arange(len(points))
     for camera, mask in zip(cameras, masks, strict=True):
         pixels, depth = camera.project(points[left])
@@ -200,19 +200,19 @@ def _inside_masks(
         column, row = pixels.nan_to_num(0).clamp(-1, 1e6).long().unbind(1)
         inside[left] += framed & (mask[row.clamp(0, height - 1), column.clamp(0, width - 1)] > 0.5)
         shown[left] += framed
-        # most of a grid is soon outside of more masks than may be wrong
+        # drop points outside more masks than may be wrong, which soon are most of the grid
         left = left[shown[left] - inside[left] <= (1 - _AGREEING) * len(cameras)]
     return (shown >= _SHOWN * len(cameras)) & (inside >= _AGREEING * shown)
 
 
 def _eroded(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """A mask without the pixels at its rim: what lies there would show beside the object."""
+    """Remove a mask's rim, because Gaussians in it would show beside the object."""
     size = 2 * _RIM_PX + 1
     return -torch.nn.functional.max_pool2d(-mask[None, None], size, stride=1, padding=_RIM_PX)[0, 0]
 
 
 def _seen(hull: _Hull, cameras: Cameras) -> Bool[Tensor, "m"]:
-    """Which points of a hull's surface some camera sees: they face it, and the hull does not hide them."""
+    """Test which points of a hull's surface face a camera and are not hidden from it by the hull."""
     seen = torch.zeros(len(hull.points), dtype=torch.bool)
     side = float(hull.voxel.min())
     steps = torch.arange(_BIAS, 3**0.5 * _GRID * float(hull.voxel.max()) / side)
@@ -227,9 +227,9 @@ def _seen(hull: _Hull, cameras: Cameras) -> Bool[Tensor, "m"]:
 
 
 def _is_bare(hull: _Hull, object_: Gaussians) -> Bool[Tensor, "m"]:
-    """Behind which points of a hull the object has no surface in the nearer half of the hull.
+    """Test which points of a hull have no surface of the object behind them, in the nearer half of the hull.
 
-    What lies in the farther half is the inside of the opposite side.
+    A surface in the farther half is the inside of the opposite side.
     """
     axes = rotation_from_quaternion(object_.quaternions) * object_.scales[:, None]
     flat = axes.gather(2, object_.log_scales.topk(2).indices[:, None].expand(-1, 3, -1))
@@ -249,12 +249,12 @@ def _is_bare(hull: _Hull, object_: Gaussians) -> Bool[Tensor, "m"]:
 
 
 def _cells(hull: _Hull, points: Float[Tensor, "p s 3"]) -> tuple[Int[Tensor, "p s"], ...]:
-    """Indices of the voxels at points; those at the grid's border are empty."""
+    """Return the indices of the voxels at points; points outside get voxels at the border, which are empty."""
     return ((points - hull.low) / hull.voxel).long().clamp(0, _GRID - 1).unbind(-1)
 
 
 def _shows(closing: Gaussians, object_: Gaussians, cameras: Cameras) -> Bool[Tensor, "n"]:
-    """Which Gaussians some photograph would show beside the object or through it, where it must stay as it is."""
+    """Test which Gaussians would show in a photograph, beside the object or through it."""
     both = concatenate([object_, closing])
     shows = torch.zeros(closing.count, dtype=torch.bool)
     area = 2 * math.pi * closing.scales.topk(2).values.prod(1)
@@ -269,7 +269,7 @@ def _shows(closing: Gaussians, object_: Gaussians, cameras: Cameras) -> Bool[Ten
 
 
 def _continued(hull: _Hull, seen: Bool[Tensor, "m"], object_: Gaussians) -> Float[Tensor, "m 3"]:
-    """Band 0 at the points of a hull: that of the object where it was seen, and a smooth continuation elsewhere."""
+    """Compute band 0 at the points of a hull: the object's where it was seen, and a smooth continuation elsewhere."""
     _, nearest = KDTree(object_.means.numpy()).query(hull.points.numpy(), k=min(_NEIGHBOURS, object_.count))
     known = object_.sh[:, 0][torch.from_numpy(nearest).reshape(len(hull.points), -1)].mean(1)
     _, around = KDTree(hull.points.numpy()).query(hull.points.numpy(), k=min(_NEIGHBOURS, len(hull.points)))

@@ -1,5 +1,5 @@
-"""The program that runs pycolmap (its only importer) in a process of its own: features, matches, poses and points.
+"""Program that runs pycolmap in a process of its own: features, matches, poses and points.
 
-A process of its own, since pycolmap's bundled zlib corrupts the heap of one that also loads Pillow, and since its C++
-checks end the process. Of its modules, other code may import `job` alone.
+It is the only importer of pycolmap. Two reasons keep it out of the main process: pycolmap's bundled zlib corrupts the
+heap of a process that also loads Pillow, and its C++ checks end the process. Other code may only import `job`.
 """

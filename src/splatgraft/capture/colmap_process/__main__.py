@@ -1,4 +1,4 @@
-"""Starts the program: `python FOLDER JOB`, without the package that the folder lies in."""
+"""Start the program as `python FOLDER JOB`, without importing the package around this folder."""
 
 import json
 import sys

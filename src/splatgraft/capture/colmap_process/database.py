@@ -1,6 +1,6 @@
-"""COLMAP's databases: features of all photos, verified matches between them, and the focal lengths to start from.
+"""COLMAP databases: features of all photos, verified matches between them, and initial focal lengths.
 
-A killed run leaves whole databases to the next: each is written beside its place and then moved there.
+Each database is written under another name and then moved to its place, so a killed run leaves only complete ones.
 """
 
 import os
@@ -16,26 +16,22 @@ import pycolmap
 from .job import MIN_TRACK, Job
 
 NEIGHBOURING, PROMISING, ALL = "neighbouring", "promising", "all"
-_FEATURES = 4000  # of a photo, the largest; the time of matching goes with its square. COLMAP takes 8192.
-_LARGE_PX = 1200
-"""Longest side from which photos are not doubled in size to find features, which takes two thirds of the time."""
-_PRESELECT_ABOVE = 24  # photos; up to this many, all pairs are compared with all features
-_PRESELECT_FEATURES = 1000
-"""Largest features of a photo by which its partners are found (preemptive matching: Wu 2013, section 3)."""
-_PRESELECT_PARTNERS = 8  # A photo with fewer partners than this is compared with all others
-_MOST_PARTNERS = 16
-"""Partners of a photo, those with most matches first: a background that stands still matches in all photos."""
-_FOCAL_RANGE = (0.35, 5.0)
-"""Focal lengths, in longest sides of the photo, that are believed of the view graph's calibration."""
+_FEATURES = 4000  # largest features kept per photo; matching time grows with its square (COLMAP: 8192)
+_LARGE_PX = 1200  # longest side from which SIFT skips the octave of doubled size, two thirds of its time
+_PRESELECT_ABOVE = 24  # largest number of photos for which all pairs are matched with all features at once
+_PRESELECT_FEATURES = 1000  # largest features of a photo in preemptive matching (Wu 2013, section 3)
+_PRESELECT_PARTNERS = 8  # photos with fewer partners than this are matched with all others
+_MOST_PARTNERS = 16  # most partners of a photo; a static background matches in all photos
+_FOCAL_RANGE = (0.35, 5.0)  # plausible calibrated focal lengths, over the longest side of the photo
 
 Selection = Callable[[int, np.ndarray], np.ndarray]
-"""From the number of a photo and its features (n, 2 or more: x, y, shape) to the indices of those that stay."""
+"""Choice of features: takes the id of a photo and its features (n, 2 or more: x, y, shape), returns indices to keep."""
 
 
 def find_features(job: Job) -> None:
-    """Make the database of `job` with a camera per group and the features of all photos; go on where a killed run was.
+    """Make the database of `job` with one camera per group and the features of all photos.
 
-    The focal length of a camera starts from EXIF where there is one.
+    Focal lengths start from EXIF if it has one. Features that a killed run left are kept.
     """
     database = job.folder / "photos.db"
     alone = [names[0] for names in job.groups if len(names) == 1]
@@ -46,7 +42,7 @@ def find_features(job: Job) -> None:
         partial = fresh(job.folder / "partial.db")
         pycolmap.Database.open(partial).close()
         for mode, names in groups:
-            # before the features, whose threads would number the photos as they finish
+            # first, because the threads that find features would number photos in the order in which they finish
             pycolmap.import_images(partial, photos, mode, image_names=names, options=reader)
         os.replace(partial, database)
     extraction = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
@@ -74,16 +70,16 @@ def find_features(job: Job) -> None:
 
 
 def fresh(path: Path) -> Path:
-    """`path`, with what a killed run left there removed."""
+    """Remove the database at `path` that a killed run may have left, and return `path`."""
     for suffix in ("", "-wal", "-shm", "-journal"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
     return path
 
 
 def copy_database(source: Path, target: Path) -> Path:
-    """`target` as a whole copy of `source`, or not at all."""
+    """Copy the database `source` to `target`, completely or not at all."""
     partial = fresh(target.with_suffix(".partial"))
-    # SQLite may hold a part of its content in files beside it
+    # SQLite's own copy, because a part of a database may lie in files beside it
     with closing(sqlite3.connect(source)) as original, closing(sqlite3.connect(partial)) as copy:
         original.backup(copy)
     os.replace(partial, target)
@@ -91,7 +87,7 @@ def copy_database(source: Path, target: Path) -> Path:
 
 
 def copy_with_features(source: Path, target: Path, select: Selection) -> None:
-    """Make a copy of `source` without matches and with the selected features alone, where there is none yet."""
+    """Copy `source` to `target` with only the selected features and no matches, unless `target` exists."""
     if target.exists():
         return
     partial = copy_database(source, target.with_suffix(".selected"))
@@ -113,7 +109,7 @@ def copy_with_features(source: Path, target: Path, select: Selection) -> None:
 
 
 def inside_masks(job: Job, database: Path) -> Selection:
-    """Selects the features on which the photo's mask is not black; all features of a photo without a mask."""
+    """Make a selection of the features at which the photo's mask is not black, or of all if it has no mask."""
     names = _names(database)
 
     def select(i: int, keypoints: np.ndarray) -> np.ndarray:
@@ -132,8 +128,8 @@ def inside_masks(job: Job, database: Path) -> Selection:
 
 
 def _largest(_: int, keypoints: np.ndarray) -> np.ndarray:
-    """Selects the largest features."""
-    # x, y, then the rows of the affine shape; its first column is as long as the feature is large
+    """Select the largest features."""
+    # columns 2 to 5 hold the affine shape by rows; the length of its first column is the feature's size
     return np.argsort(-np.hypot(keypoints[:, 2], keypoints[:, 4]), kind="stable")[:_PRESELECT_FEATURES]
 
 
@@ -143,13 +139,13 @@ def _names(database: Path) -> dict[int, str]:
 
 
 def levels(job: Job) -> list[str]:
-    """Choices of pairs, the cheapest first; each holds the earlier ones."""
+    """Return the choices of pairs, the cheapest first; each contains the ones before it."""
     choices = [PROMISING, ALL] if len(job.names) > _PRESELECT_ABOVE else [ALL]
     return choices if job.exhaustive else [NEIGHBOURING, *choices]
 
 
 def match(job: Job, database: Path, level: str) -> int:
-    """Match the pairs of `level` that are not matched already; gives their number."""
+    """Match the pairs of `level` that are not matched yet, and return their number."""
     before = _matched(database)
     matching = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     if job.thorough:
@@ -169,19 +165,19 @@ def match(job: Job, database: Path, level: str) -> int:
 
 
 def unmatched_pairs(job: Job, database: Path) -> int:
-    """Pairs that were not compared yet."""
+    """Count the pairs that were not matched yet."""
     photos = len(job.names)
     return photos * (photos - 1) // 2 - _matched(database)
 
 
 def _matched(database: Path) -> int:
-    """Pairs that were compared, with or without a match."""
+    """Count the pairs that were matched, including pairs without a match."""
     with closing(sqlite3.connect(database)) as opened:
         return int(opened.execute("SELECT COUNT(*) FROM two_view_geometries").fetchone()[0])
 
 
 def _promising_pairs(job: Job, database: Path) -> Path:
-    """The file of pairs whose largest features match best; a photo with few of these is paired with every other."""
+    """Write a file of the pairs whose largest features match best; photos with few such pairs get all pairs."""
     listed, small = database.with_suffix(".pairs.txt"), database.with_suffix(".small.db")
     if listed.exists():
         return listed
@@ -205,7 +201,7 @@ def _promising_pairs(job: Job, database: Path) -> Path:
 
 
 def copy_with_cameras(source: Path, target: Path, change: Callable[[Any], None]) -> Path:
-    """A copy of the database `source` at `target`, each camera as `change` leaves it."""
+    """Copy the database `source` to `target` and apply `change` to each of its cameras."""
     copy_database(source, fresh(target))
     with pycolmap.Database.open(target) as opened:
         for camera in opened.read_all_cameras():
@@ -215,10 +211,10 @@ def copy_with_cameras(source: Path, target: Path, change: Callable[[Any], None])
 
 
 def with_calibrated_focals(database: Path, target: Path, seed: int) -> Path:
-    """A copy at `target` with a focal length by camera: from EXIF where COLMAP read one, else from all pairs' geometry.
+    """Copy `database` to `target` with a focal length per camera: from EXIF, else from view graph calibration.
 
-    They are found on another copy, since COLMAP also estimates the pairs anew, and with its 1 px that leaves fewer
-    matches.
+    The calibration runs on another copy, because COLMAP then verifies all pairs again with a limit of 1 px, which
+    leaves fewer matches.
     """
     copy = copy_database(database, database.with_suffix(".calibrated.db"))
     with pycolmap.Database.open(database) as original:
@@ -236,7 +232,7 @@ def with_calibrated_focals(database: Path, target: Path, seed: int) -> Path:
         if cameras[i].has_prior_focal_length or not believed:
             focals[i] = float(cameras[i].params[0])
         elif count[i] < MIN_TRACK < count[common]:
-            # a photo or two say little of a focal length; most likely the others' lens, at another size
+            # one or two photos do not determine a focal length: assume the others' lens at another size
             focals[i] = focals[common] * size / max(cameras[common].width, cameras[common].height)
         else:
             focals[i] = found[i]

@@ -1,4 +1,4 @@
-"""What the COLMAP process is told, and what it tells its parent: lines `PHASE MESSAGE` for the bar, `- SENTENCE`."""
+"""Job of the COLMAP process, and its output to the parent: lines `PHASE MESSAGE` for the bar, and `- SENTENCE`."""
 
 import time
 from collections.abc import Generator
@@ -8,27 +8,27 @@ from pathlib import Path
 
 PHASES = ("features", "matching", "mapping", "refinement")
 MIN_TRACK = 3
-"""Photos that must see a point for it to count; two photos make a point of any false match."""
+"""Fewest photos that must see a reliable point; with two, any false match makes a point."""
 MAX_ERROR_PX = 1.5
-"""Largest mean reprojection error of a point that counts."""
+"""Largest mean reprojection error of a reliable point, pixels."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be posed, how, and where the process keeps what a killed run leaves to the next."""
+    """Photos to pose, options, and the folder from which a killed run is continued."""
 
     photos: str
     """Folder of the working copies."""
     masks: str
-    """Folder of masks, NAME.jpg.png for NAME.jpg, black where features do not count; empty where there is none."""
+    """Folder of masks, NAME.jpg.png for NAME.jpg, black where features are ignored; empty string without masks."""
     scratch: str
-    """Folder for databases and models; what lies there from a run of the same job is used."""
+    """Folder for databases and models; results of an earlier run of the same job are used."""
     thorough: bool
-    """Whether to find more features, and to match them with a wider limit."""
+    """Whether more features are found and matched with a wider limit."""
     groups: list[list[str]]
     """File names of the photos that share a camera."""
     exhaustive: bool
-    """Whether all pairs of photos are compared, or neighbours in name order."""
+    """Whether all pairs of photos are matched from the start, instead of neighbours in name order."""
     threads: int
     """CPU threads."""
     seed: int
@@ -41,34 +41,34 @@ class Job:
 
     @property
     def folder(self) -> Path:
-        """`scratch` as a path."""
+        """The scratch folder as a path."""
         return Path(self.scratch)
 
     @property
     def output(self) -> Path:
-        """The file for the best model."""
+        """File of the best model."""
         return self.folder / "best.json"
 
 
 def say(sentence: str) -> None:
-    """Tell the parent a sentence for people."""
+    """Send a sentence for the user to the parent process."""
     print(f"- {sentence}", flush=True)
 
 
 @dataclass
 class Clock:
-    """Seconds per phase."""
+    """Time spent per phase."""
 
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
-    """Wall-clock time."""
+    """Wall-clock time by phase, seconds."""
     cpu_seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PHASES, 0.0))
-    """CPU time of all threads."""
+    """CPU time of all threads by phase, seconds."""
     pairs: int = 0
     """Pairs matched so far."""
 
     @contextmanager
     def phase(self, name: str) -> Generator[None]:
-        """Count the time of the block, and say that it begins."""
+        """Announce the phase and add the time of the block to it."""
         print(f"{PHASES.index(name)} {name}", flush=True)
         start, cpu_start = time.monotonic(), time.process_time()
         try:
@@ -79,5 +79,5 @@ class Clock:
 
     @property
     def seconds_per_pair(self) -> float:
-        """Seconds that matching takes per pair; 0 where none was measured."""
+        """Matching time per pair, seconds; 0 before the first pair."""
         return self.seconds["matching"] / self.pairs if self.pairs else 0.0

@@ -1,8 +1,14 @@
-"""The search for a model: matchings and masks, the likeliest first, until one model holds and explains enough.
+"""Search for a model that poses enough photos and explains enough of their matches.
 
-Models are made by the global mapper (GLOMAP: Pan et al. 2024, Global Structure-from-Motion Revisited), which averages
-the rotations of all pairs. The incremental mapper starts from one pair, whose pose can be wrong at a small error where
-its matches lie on a plane; the lens that all photos share then bends until the rest fits.
+The search tries, in this order, until a model is good enough:
+
+1. the cheapest choice of pairs, with all features;
+2. the same pairs, with the features inside the masks;
+3. more pairs, with the features that gave the better model.
+
+The global mapper makes the models (GLOMAP: Pan et al. 2024, Global Structure-from-Motion Revisited), because it
+averages the rotations of all pairs. The incremental mapper starts from one pair. If the matches of this pair lie on a
+plane, its pose can be wrong at a small error, and the shared lens is then distorted until the other photos fit.
 """
 
 import json
@@ -27,14 +33,13 @@ from .job import Clock, Job, say
 from .refinement import refined
 from .scores import Answer, best_of, connected_photos, unposed
 
-_ALL, _MASKED = "photos", "masked"
-"""Names of the databases: with all features, and with those inside the masks."""
-_ENOUGH_PHOTOS = 0.9  # A model with this share of all photos, and with all that have matches, may end the search
-_CLEAR_EXPLAINED = 0.5  # it ends the search where it explains this share of all verified matches
+_ALL, _MASKED = "photos", "masked"  # names of the databases with all features, and with those inside the masks
+_ENOUGH_PHOTOS = 0.9  # smallest share of photos with a pose at which the search may end
+_CLEAR_EXPLAINED = 0.5  # smallest share of verified matches explained at which the search may end
 
 
 def main(words: dict[str, Any]) -> None:
-    """The best model of the job in `words` goes to its output, as JSON."""
+    """Write the best model of the job in `words` to its output file, as JSON."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)  # pyright: ignore[reportAttributeAccessIssue]
     job, clock = Job(**words), Clock()
@@ -47,15 +52,15 @@ def main(words: dict[str, Any]) -> None:
 
 
 def _end_with_parent() -> None:
-    """A parent that is killed closes its end of the standard input; the next run then has the databases to itself."""
-    # not sys.stdin, whose lock ends Python with an error when a thread holds it at the end
+    """End this process when standard input closes, as it does if the parent is killed; the next run needs its files."""
+    # sys.stdin has a lock; if a thread holds it at exit, Python ends with an error
     while os.read(0, 1):
         pass
     os._exit(1)
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
-    """Write JSON as a whole or not at all."""
+    """Write JSON completely or not at all."""
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(content))
     os.replace(partial, path)
@@ -65,13 +70,13 @@ def _search(job: Job, clock: Clock) -> Answer:
     answers: list[Answer] = []
 
     def is_enough_after(name: str, level: str) -> bool:
-        """Match the pairs of `level`, make a model, and say whether the search may end with it."""
+        """Match the pairs of `level`, make a model, and return whether the search may end."""
         database = _database(job, name)
         with clock.phase("matching"):
             clock.pairs += match(job, database, level)
         answers.append(_answer(job, clock, name, level))
         posed = len(answers[-1]["images"])
-        # more pairs may connect photos that have too few matches so far
+        # before the last level, photos without matches may still get some from more pairs
         return (
             answers[-1]["explained"] >= _CLEAR_EXPLAINED
             and posed >= _ENOUGH_PHOTOS * connected_photos(_database(job, _ALL))
@@ -82,7 +87,7 @@ def _search(job: Job, clock: Clock) -> Answer:
     if is_enough_after(_ALL, first):
         return _best(answers)
     if job.masks:
-        say(f"{_shortfall(answers, job)}: tried again with the features inside the masks alone")
+        say(f"{_shortfall(answers, job)}: trying again with only the features inside the masks")
         all_features = _database(job, _ALL)
         copy_with_features(all_features, _database(job, _MASKED), inside_masks(job, all_features))
         if is_enough_after(_MASKED, first):
@@ -93,7 +98,7 @@ def _search(job: Job, clock: Clock) -> Answer:
             break
         pairs, seconds = unmatched_pairs(job, _database(job, best["database"])), clock.seconds_per_pair
         time = f", about {max(1, round(pairs * seconds / 60))} min" if seconds else ""
-        say(f"{_shortfall(answers, job)}: up to {pairs} more pairs of photos are compared{time}")
+        say(f"{_shortfall(answers, job)}: comparing up to {pairs} more pairs of photos{time}")
         if is_enough_after(best["database"], level):
             break
     return _best(answers)
@@ -104,7 +109,7 @@ def _database(job: Job, name: str) -> Path:
 
 
 def _answer(job: Job, clock: Clock, name: str, level: str) -> Answer:
-    """The model of the matches in a database, read from the scratch folder where a killed run left it."""
+    """Make a model from the matches in a database, or read the one that a killed run left in the scratch folder."""
     method = f"global, {level} pairs{' inside the masks' if name == _MASKED else ''}"
     path = job.folder / "answers" / f"{method}.json"
     if not path.is_file():
@@ -120,10 +125,10 @@ def _answer(job: Job, clock: Clock, name: str, level: str) -> Answer:
 
 
 def _best(answers: list[Answer]) -> Answer:
-    """The best score with all features, or with those inside the masks where these pose more photos or explain more.
+    """Choose between the best model with all features and the best with the features inside the masks.
 
-    Masks leave out what is hardest to explain, so that more than `_CLEAR_EXPLAINED` speaks for neither side; the
-    background then counts, which makes poses more accurate where the scene is still.
+    Masks remove the matches that are hardest to explain. Explained shares are therefore compared only up to
+    `_CLEAR_EXPLAINED`. Ties go to all features, because a still background makes poses more accurate.
     """
     best: dict[str, Answer] = {}
     for answer in sorted(answers, key=lambda answer: (answer["database"] == _MASKED, -answer["score"])):
@@ -132,7 +137,7 @@ def _best(answers: list[Answer]) -> Answer:
 
 
 def _shortfall(answers: list[Answer], job: Job) -> str:
-    """What the best model so far lacks."""
+    """Describe the best model so far by photos and explained matches."""
     best = _best(answers)
     return f"{len(best['images'])} of {len(job.names)} photos, {best['explained']:.0%} of matches explained"
 
@@ -141,7 +146,7 @@ def _global_models(job: Job, database: Path) -> list[Any]:
     folder = job.folder / "models"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    # one thread: more add sums in another order each time, and save only a tenth of the time
+    # one thread: several add sums in another order each time, and save only a tenth of the time
     options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=job.seed, min_model_size=3)
     options.mapper.bundle_adjustment.ceres.use_gpu = False
     options.mapper.global_positioning.use_gpu = False

@@ -1,12 +1,12 @@
-"""Refinement of a model: outliers dropped, all cameras adjusted, and the photos that it explains worst posed anew.
+"""Refinement of a model: bundle adjustment, new poses for badly explained photos, and lenses of cropped photos.
 
-The global mapper places all photos at once, and a few of them wrongly, towards which the shared lens bends. Such photos
-are taken out, the rest is adjusted, and each is posed from the points of the rest.
-
-A camera starts as COLMAP's SIMPLE_RADIAL with the principal point in the middle of the photo. In a photo cut out of a
-larger one it lies elsewhere, and a radial distortion around the middle bends to make up for it. Of photos that are not
-as large as the others, the principal point is solved as well, and where that is not enough the four numbers of OPENCV's
-distortion: for all photos these would trade against the poses.
+1. Bundle adjustment of all cameras and points, and removal of outliers.
+2. New poses. The global mapper poses a few photos wrongly, and the shared lens is distorted to fit them. These photos
+   are removed, the others are adjusted, and each removed photo is posed from the points of the others.
+3. Lenses of crops. A camera starts as COLMAP's SIMPLE_RADIAL with the principal point at the centre of the photo. In a
+   crop of a larger photo it lies elsewhere. For photos of unusual size, the principal point is solved too, and then the
+   four coefficients of COLMAP's OPENCV lens if that still fits better. Solving these for all photos would be ambiguous
+   with the poses.
 """
 
 from pathlib import Path
@@ -19,19 +19,16 @@ from .database import copy_with_cameras
 from .job import Job, say
 from .scores import ALIKE, Matches, explained_shares, lens_numbers, posed_and_explained, read_matches
 
-_POOR_SHARE = 0.8  # A photo with less than this of the median photo's share of matches explained is posed anew
-_LENS_OBSERVATIONS = 300
-"""Points that the photos of one camera must see for its whole lens to be solved: 30 for each of its numbers."""
-_LENS_ROUNDS = 3  # how often a lens is solved, each time with the matches that the last one explains
-_LENS_ERROR = 0.9  # share to which the mean reprojection error of these photos must fall for their lenses to be taken
-_ADJUSTMENTS = 5
-"""The most bundle adjustments in a row, each followed by dropping outliers (COLMAP: ba_global_max_refinements)."""
-_ADJUSTED_CHANGE = 0.0005
-"""Share of observations that changed below which they end (COLMAP: ba_global_max_refinement_change)."""
+_POOR_SHARE = 0.8  # photos whose explained share of matches is below this fraction of the median get a new pose
+_LENS_OBSERVATIONS = 300  # fewest observed points for which a whole lens is solved: about 30 per unknown
+_LENS_ROUNDS = 3  # solutions of a lens, each with the matches that the last one explains
+_LENS_ERROR = 0.9  # largest ratio of mean reprojection errors, after over before, at which a solved lens is kept
+_ADJUSTMENTS = 5  # most bundle adjustments in a row, each removes outliers (COLMAP: ba_global_max_refinements)
+_ADJUSTED_CHANGE = 0.0005  # end below this share of changed observations (COLMAP: ba_global_max_refinement_change)
 
 
 def refined(job: Job, database: Path, models: list[Any]) -> Any:
-    """The best of `models`, of which there is at least one, refined."""
+    """Refine the best of `models`, which are at least one."""
     matches, refiner = read_matches(database), _Refiner(job, database)
     start = max(models, key=lambda model: posed_and_explained(matches, model))
     best = _reposed(refiner, matches, refiner.adjusted(refiner.with_all_photos(start)))
@@ -41,7 +38,7 @@ def refined(job: Job, database: Path, models: list[Any]) -> Any:
 
 
 def _reposed(refiner: "_Refiner", matches: Matches, model: Any) -> Any:
-    """The model with badly explained photos, and those without a pose, posed anew as long as the score grows."""
+    """Pose badly explained photos and photos without a pose again, as long as the score increases."""
     best, tried_before = model, set()
     while True:
         shares = explained_shares(matches, best)
@@ -58,10 +55,10 @@ def _reposed(refiner: "_Refiner", matches: Matches, model: Any) -> Any:
 
 
 def _with_own_lenses(job: Job, database: Path, matches: Matches, model: Any) -> Any:
-    """The model with the lenses of crops solved, where these photos then fit better and no fewer matches do.
+    """Solve the lenses of crops; keep a lens if its photos fit better and no fewer matches are explained.
 
-    With a radial distortion around the optical axis first, which is right where a photo was cut out of a larger one;
-    with OPENCV's, whose tangential part trades against the axis, where that fits better still.
+    The first attempt has a radial distortion around the optical axis, which is right for a crop of a larger photo. The
+    second has COLMAP's OPENCV lens, whose tangential part is ambiguous with the axis.
     """
     photos = _crops(model)
     images, best = [i for posed in photos.values() for i in posed], model
@@ -79,9 +76,9 @@ def _with_own_lenses(job: Job, database: Path, matches: Matches, model: Any) -> 
 
 
 def _crops(model: Any) -> dict[int, list[int]]:
-    """Posed photos by camera, of the cameras whose photos have another size than most; none where these are not fewer.
+    """Return the posed photos of each camera with an unusual photo size; none if no size has the majority.
 
-    A photo taken upright has the size of one taken across. A camera whose photos see too few points is left out.
+    Portrait and landscape photos of one camera count as one size. Cameras that observe too few points are left out.
     """
     images: dict[int, list[int]] = {}
     for i in sorted(model.reg_image_ids()):
@@ -101,7 +98,7 @@ def _crops(model: Any) -> dict[int, list[int]]:
 
 
 def _with_full_lenses(database: Path, target: Path, cameras: set[int]) -> Path:
-    """A copy of `database` at `target` in which `cameras` have OPENCV's lens."""
+    """Copy `database` to `target` and give `cameras` COLMAP's OPENCV lens."""
 
     def widen(camera: Any) -> None:
         if camera.camera_id in cameras:
@@ -113,7 +110,7 @@ def _with_full_lenses(database: Path, target: Path, cameras: set[int]) -> Path:
 
 
 def _mean_error_px(model: Any, images: list[int]) -> float:
-    """Mean reprojection error over what the photos see, pixels."""
+    """Compute the mean reprojection error over all observations of `images`, pixels."""
     errors: list[float] = []
     for i in images:
         image = model.images[i]
@@ -131,7 +128,7 @@ def _describe_crop(model: Any, camera: int, images: list[int]) -> str:
     right, below = cx - found.width / 2, cy - found.height / 2
     across, down = "right" if right >= 0 else "left", "below" if below >= 0 else "above"
     return (
-        f"{names}: of another size than most photos, so the lens was solved apart: its axis lies {abs(right):.0f} px "
+        f"{names}: size differs from most photos, so the lens was solved separately: its axis lies {abs(right):.0f} px "
         f"{across} of the middle and {abs(below):.0f} px {down} it"
     )
 
@@ -140,7 +137,7 @@ class _Refiner:
     """COLMAP's incremental mapper with the matches of one database."""
 
     def __init__(self, job: Job, database: Path) -> None:
-        # one thread: more add sums in another order each time
+        # one thread: several add sums in another order each time
         self._options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=job.seed)
         self._mapping = self._options.get_mapper()
         self._triangulation = self._options.get_triangulation()
@@ -151,9 +148,9 @@ class _Refiner:
             self._cache = pycolmap.DatabaseCache.create(opened, caching)
 
     def with_all_photos(self, model: Any) -> Any:
-        """A copy of the model that also has the photos without a pose, which mappers drop when they end.
+        """Copy the model and add the photos without a pose, which mappers drop at their end.
 
-        Its cameras have the kind of lens that the database says, which is the same or a fuller one.
+        Cameras take the database's kind of lens, which has at least as many coefficients as the model's.
         """
         whole = pycolmap.Reconstruction()
         whole.load(self._cache)
@@ -168,13 +165,13 @@ class _Refiner:
         return whole
 
     def with_lenses(self, model: Any, photos: dict[int, list[int]]) -> Any:
-        """The model with a lens solved for each of the cameras in `photos`, with its principal point, from its photos.
+        """Solve the lens and the principal point of each camera in `photos` from its own photos.
 
-        All else is held until the lens is right; then all cameras are adjusted, these with their principal point held.
+        Points and other photos are fixed at first. Then all cameras are adjusted with fixed principal points.
         """
         mapper = self._begin(model)
         options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, refine_points3D=False)
-        # features far from the wrong lens's middle are off by more than others, and are no outliers
+        # under a wrong lens, errors grow towards the corners; such features are not outliers
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         for images in photos.values():
             for _ in range(_LENS_ROUNDS):
@@ -187,14 +184,14 @@ class _Refiner:
         return self._finished(mapper, model)
 
     def adjusted(self, model: Any) -> Any:
-        """The model with tracks completed and merged, all cameras and points adjusted, and outliers dropped."""
+        """Complete and merge the tracks, adjust all cameras and points, and remove outliers."""
         mapper = self._begin(model)
         for i in sorted(model.reg_image_ids()):
             mapper.triangulate_image(self._triangulation, i)
         return self._finished(mapper, model)
 
     def reposed(self, model: Any, poor: list[int]) -> Any:
-        """The model with its photos `poor`, and those without a pose, posed from the points of the others."""
+        """Pose the photos `poor`, and photos without a pose, from the points of the others."""
         mapper = self._begin(model)
         for i in poor:
             mapper.observation_manager.deregister_frame(model.images[i].frame_id)

@@ -1,8 +1,8 @@
-"""Figures of a model, and the one score by which models are compared.
+"""Score and figures of a model.
 
-The score is the share of all photos with a pose times the share of verified matches that the model explains: both
-features of a match see one point, which `MIN_TRACK` photos see with a mean error of at most `MAX_ERROR_PX`. It counts
-what COLMAP dropped, which a reprojection error does not.
+The score is the share of photos with a pose times the share of verified matches that the model explains. A match is
+explained if both its features see the same point, and if at least `MIN_TRACK` photos see this point with a mean error
+of at most `MAX_ERROR_PX`. Unlike the reprojection error, the score counts the matches that COLMAP dropped.
 """
 
 from pathlib import Path
@@ -13,18 +13,18 @@ import pycolmap
 
 from .job import MAX_ERROR_PX, MIN_TRACK
 
-_MIN_OBSERVATIONS = 30  # points that a photo must see for its pose to count (COLMAP: abs_pose_min_num_inliers)
+_MIN_OBSERVATIONS = 30  # fewest points that a photo must see for its pose to count (COLMAP: abs_pose_min_num_inliers)
 ALIKE = 0.99
-"""Models whose score is above this share of the best one's are compared by their reprojection errors."""
+"""Smallest ratio of a score to the best one at which two models count as equally good."""
 
 Answer = dict[str, Any]
-"""A model as plain numbers: its images with poses and cameras, its points, and its score."""
+"""A model as plain numbers: images with poses and cameras, points, and score."""
 Matches = list[tuple[int, int, np.ndarray]]
-"""Numbers of two photos, and (n, 2) the numbers of their features that match."""
+"""Ids of two photos and the ids of their matching features (n, 2), for each pair."""
 
 
 def read_matches(database: Path) -> Matches:
-    """The verified matches of all pairs."""
+    """Read the verified matches of all pairs."""
     with pycolmap.Database.open(database) as opened:
         pairs, geometries = opened.read_two_view_geometries()
     return [
@@ -35,10 +35,10 @@ def read_matches(database: Path) -> Matches:
 
 
 def best_of(database: Path, models: list[Any], photos: int) -> Answer:
-    """The best of `models` as plain numbers; without images where there is none.
+    """Return the best of `models` as plain numbers, without images if there are no models.
 
-    Where nearly all matches are explained, a model with a wrong lens explains as many as one with the right lens, so
-    that among models of about the same score the reprojection error decides.
+    Among models of nearly equal score, the reprojection error decides. If nearly all matches are explained, a model
+    with a wrong lens can explain as many as one with the right lens.
     """
     if not models:
         return {"images": [], "points": [], "mean_reprojection_px": 0.0, "explained": 0.0, "score": 0.0}
@@ -50,13 +50,13 @@ def best_of(database: Path, models: list[Any], photos: int) -> Answer:
 
 
 def posed_and_explained(matches: Matches, model: Any) -> float:
-    """The number of photos with a pose that counts times the share of `matches` explained."""
+    """Compute the number of photos with a reliable pose times the explained share of `matches`."""
     seen = _seen_points(model)
     return len(seen) * _count_explained(seen, matches) / _count(matches)
 
 
 def explained_shares(matches: Matches, model: Any) -> dict[int, float]:
-    """By photo with a pose: the share of its matches with other such photos that the model explains."""
+    """Compute, for each photo with a pose, the explained share of its matches with other posed photos."""
     seen = _seen_points(model)
     counts = {i: np.zeros(2) for i in model.reg_image_ids()}
     for a, b, rows in matches:
@@ -67,7 +67,7 @@ def explained_shares(matches: Matches, model: Any) -> dict[int, float]:
 
 
 def connected_photos(database: Path) -> int:
-    """Photos that can have a pose at all: with enough verified matches to some other photo."""
+    """Count the photos that can get a pose because they have enough verified matches with another photo."""
     return len({i for *pair, rows in read_matches(database) if len(rows) >= _MIN_OBSERVATIONS for i in pair})
 
 
@@ -87,7 +87,7 @@ def _explained(seen: dict[int, np.ndarray], a: int, b: int, rows: np.ndarray) ->
 
 
 def _seen_points(model: Any) -> dict[int, np.ndarray]:
-    """By photo with a pose that counts: for each of its features the number of its point that counts, or -1."""
+    """Return, for each photo with a reliable pose, the reliable point of each of its features, or -1."""
     counts = {i for i, p in model.points3D.items() if p.track.length() >= MIN_TRACK and p.error <= MAX_ERROR_PX}
     seen = {
         i: np.array([p.point3D_id if p.point3D_id in counts else -1 for p in image.points2D], dtype=np.int64)
@@ -121,7 +121,7 @@ def _numbers(matches: Matches, model: Any) -> Answer:
 
 
 def lens_numbers(camera: Any) -> list[float]:
-    """fx, fy, cx, cy, k1, k2, p1, p2 of a camera with a SIMPLE_RADIAL or OPENCV lens."""
+    """Return fx, fy, cx, cy, k1, k2, p1, p2 of a camera with a SIMPLE_RADIAL or OPENCV lens."""
     numbers = camera.params.tolist()
     if len(numbers) == 8:
         return numbers
@@ -130,7 +130,7 @@ def lens_numbers(camera: Any) -> list[float]:
 
 
 def unposed(database: Path, answer: Answer) -> list[dict[str, Any]]:
-    """For each photo without a pose: its name, its number of features, and its most matches with one other photo."""
+    """Return name, number of features and most matches with one other photo, for each photo without a pose."""
     posed = {image["name"] for image in answer["images"]}
     most: dict[int, int] = {}
     for *pair, rows in read_matches(database):

@@ -103,7 +103,7 @@ class Capture:
         write_capture(folder, posed.limited(self.max_side) if self.max_side > 0 else posed)
 
     def _taken_over(self, context: Context) -> PosedImages:
-        """The posed capture without what is not usable, which is said."""
+        """Read the posed capture without unusable images, which are logged."""
         given = read_capture(self.capture)
         masks = describe_masks(given.image_paths, given.mask_paths)
         context.console.say(f"{self.capture}: {len(given)} posed images, {len(given.points)} points; {masks}")
