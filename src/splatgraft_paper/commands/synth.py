@@ -1,4 +1,4 @@
-"""The commands `paper synth ...` of rendered data: pairs, benchmark scenes, spheres, their checks and sheets."""
+"""The commands `paper synth ...` that render data: pairs, benchmark scenes and spheres."""
 
 import os
 from dataclasses import dataclass, field
@@ -31,7 +31,7 @@ class SynthPairs:
     """Render training pairs for a harmoniser; a killed run is continued."""
 
     out: Positional
-    """Folder for one folder per scene, manifest.jsonl and, where something failed, failures.txt."""
+    """Folder for one folder per scene, manifest.jsonl and, after failures, failures.txt."""
     scenes: int = 60
     """Number of scenes; each gives 5 cameras x objects x lights pairs."""
     first: int = 0
@@ -41,21 +41,21 @@ class SynthPairs:
     samples: int = 128
     """Light paths per pixel; with the denoiser 16 are enough for small sizes."""
     objects: int = 2
-    """Per scene; the background is rendered once for all."""
+    """Objects per scene; the background is rendered once for all."""
     lights: int = 3
     """Environment maps per object."""
     paper: bool = False
-    """As many as the paper: 190 scenes with 2 objects and 27 lights, 1,900 targets and 51,300 composites."""
+    """Render the paper's number: 190 scenes with 2 objects and 27 lights, 1,900 targets and 51,300 composites."""
     seed: int = 0
     """Seed of all random choices."""
     maps: Path | None = None
-    """Folder with .hdr and .exr environment maps; those that come with Blender where not given."""
+    """Folder with .hdr and .exr environment maps; default: the maps that come with Blender."""
     models: Path | None = None
     """Folder with .glb, .gltf, .obj and .blend models that alternate with generated objects."""
     workers: RenderWorkers = field(default_factory=RenderWorkers)
 
     def execute(self, console: Console) -> int:
-        """Render what is missing, check everything; 1 where a scene failed or a pair is faulty."""
+        """Render what is missing and check everything; return 1 if a scene failed or a pair is faulty."""
         scenes = pairs.PAPER_SCENES if self.paper else self.scenes
         plan = pairs.PairPlan(
             objects=2 if self.paper else self.objects,
@@ -104,19 +104,19 @@ class SynthBenchmark:
     size: Literal["small", "paper"] = "small"
     """small: 352x248, 40 views, 16 samples. paper: 704x496, 200 views, 128 samples."""
     scenes: tuple[str, ...] = ()
-    """Names of scenes; all nine where none is given."""
+    """Names of scenes; default: all nine."""
     rotations: bool = False
-    """Also the three scenes with the object at three rotations (name_p0, name_p1, name_p2)."""
+    """Add three scenes with the object at three rotations (NAME_p0, NAME_p1, NAME_p2)."""
     views: int | None = None
-    """Another number of views per capture."""
+    """Views per capture; default: that of --size."""
     pixels: str | None = None
-    """Another size of pictures, WIDTHxHEIGHT."""
+    """Pixels of a picture, WIDTHxHEIGHT; default: that of --size."""
     samples: int | None = None
-    """Another number of light paths per pixel."""
+    """Light paths per pixel; default: that of --size."""
     workers: RenderWorkers = field(default_factory=RenderWorkers)
 
     def execute(self, console: Console) -> int:
-        """Render what is missing, write the scenes as captures and check them; 1 where one failed."""
+        """Render what is missing, write the scenes as captures and check them; return 1 if one failed."""
         size = self._size()
         planned = {which: list(zip(benchmark.plan(which, size), self._folders(which), strict=True))
                    for which in self._chosen()}  # fmt: skip
@@ -215,7 +215,7 @@ class SynthSpheres:
     scenes: int = 400
     """Number of scenes."""
     lights: int = 3
-    """Other suns per scene."""
+    """Number of other suns per scene."""
     size: str = "64x48"
     """Pixels, WIDTHxHEIGHT."""
     seed: int = 0

@@ -1,4 +1,4 @@
-"""The commands `paper train ...`: the paper's harmoniser, its object removal, and the compact harmoniser."""
+"""The commands `paper train ...`, for the paper's harmoniser, its object removal, and the compact harmoniser."""
 
 import json
 from collections.abc import Callable
@@ -33,7 +33,7 @@ class TrainFlux:
 
     @staticmethod
     def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
-        """Put the options of --recipe before the user's own words."""
+        """Put the options of --recipe before the user's own arguments."""
         return arguments_with_recipe("train flux", words)
 
     def execute(self, console: Console) -> int:
@@ -54,7 +54,7 @@ class TrainRemoval:
 
     @staticmethod
     def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
-        """Put the options of --recipe before the user's own words."""
+        """Put the options of --recipe before the user's own arguments."""
         return arguments_with_recipe("train removal", words)
 
     def execute(self, console: Console) -> int:
@@ -78,9 +78,8 @@ class TrainCompact:
     variants: int = 1
     """Perturbed lights per pair; each adds 0.25 MB per pair at 240x160."""
     start: Path | None = None
-    """Initial weights, a compact.safetensors, to continue the training with other pairs."""
+    """Initial weights, a compact.safetensors, to continue a training with other pairs."""
     device: Device = "auto"
-    """Where to compute."""
 
     def execute(self, console: Console) -> int:
         """Write the missing priors, train, write the weights."""
@@ -113,21 +112,18 @@ class TrainCompact:
         return 0
 
 
-_CLIP_TOKENS = 77
-
-
 @dataclass(frozen=True)
 class TrainEmbed:
     """Compute the empty prompt's embeddings of FLUX (T5 and CLIP) or Stable Diffusion (CLIP)."""
 
     out: Annotated[Path | None, tyro.conf.Positional] = None
-    """File to write; where `harmonize` and `train` look, unless given."""
+    """File to write; default: the place where `harmonize` and `train` look for it."""
     base: str | None = None
-    """Folder or hub id with the text encoders and tokenizers; the default base of --kind where not given."""
+    """Folder or hub id with the text encoders and tokenizers; default: the base model of --kind."""
     tokens: int = 256
     """Length of FLUX's text sequence; schnell was distilled at 256."""
     kind: Literal["flux", "stable-diffusion"] = "flux"
-    """The model whose text encoders are used; needs transformers (pip install 'splatgraft[text]')."""
+    """Model whose text encoders are used; needs transformers (pip install 'splatgraft[text]')."""
 
     def execute(self, console: Console) -> int:
         """Write the file."""
@@ -138,7 +134,7 @@ class TrainEmbed:
         out = self.out or prompt_file(base)
         out.parent.mkdir(parents=True, exist_ok=True)
         console.say(f"{base}: CLIP embeds the empty prompt")
-        clip = _embed(base, "CLIPTokenizer", "CLIPTextModel", _CLIP_TOKENS)
+        clip = _embed(base, "CLIPTokenizer", "CLIPTextModel", 77)  # the length of CLIP's text sequence
         if self.kind == "flux":
             console.say(f"{base}: T5 embeds the empty prompt")
             tokens = _embed(base, "T5TokenizerFast", "T5EncoderModel", self.tokens, number="_2").last_hidden_state[0]
@@ -151,12 +147,13 @@ class TrainEmbed:
 
 @torch.no_grad()
 def _embed(base: str, tokenizer: str, encoder: str, length: int, *, number: str = "") -> Any:
-    """The output of a text encoder of `base` for the empty prompt, padded to `length` tokens."""
-    # by name: its types, of which none is used, take a third of the time of the whole check of types
+    """Compute a text encoder's output for the empty prompt, padded to `length` tokens."""
+    # imported by name, because pyright would spend a third of its time on types that are not used
     transformers: Any = import_module("transformers")
 
     def load(kind: str, part: str) -> Any:
-        if Path(base).is_dir() and not (Path(base) / part).is_dir():  # of which transformers makes an empty tokenizer
+        # transformers would make an empty tokenizer from a missing folder
+        if Path(base).is_dir() and not (Path(base) / part).is_dir():
             raise ValueError(f"{base}: expected {kind} in {part}/, found no such folder")
         try:
             return getattr(transformers, kind).from_pretrained(base, subfolder=part)

@@ -1,4 +1,4 @@
-"""The measurement of one method's pictures of one scene of a data set, from files alone: no scene is rendered."""
+"""Measurement of one method's pictures of one scene of the data set, from files, without rendering."""
 
 import json
 import math
