@@ -34,9 +34,6 @@ from splatgraft_paper.benchmark.methods import Method, MethodSettings, run_metho
 from splatgraft_paper.benchmark.scene import GroundTruthScene, compose_scene, perform_if_stale
 from splatgraft_paper.benchmark.table import Benchmark, Row, as_json, markdown, table_section, tables
 
-NOT_RUN_FILE = "not_run.txt"
-SECONDS_FILE = "seconds.json"
-
 
 @dataclass(frozen=True)
 class BenchmarkRun:
@@ -66,25 +63,19 @@ class BenchmarkRun:
         """Folder with the metrics and pictures of one method on one scene."""
         return self.work(scene) / "measured" / method.folder_name
 
-    def not_run_file(self, scene: GroundTruthScene, method: Method) -> Path:
-        """File with the reason why a method could not run on a scene; absent if it ran."""
+    def outcome_file(self, scene: GroundTruthScene, method: Method) -> Path:
+        """File with the seconds of a method's steps on a scene, or the reason why it could not run."""
         out = self.measured(scene, method)
-        return out.with_name(f"{out.name}.{NOT_RUN_FILE}")
-
-    def seconds_file(self, scene: GroundTruthScene, method: Method) -> Path:
-        """File with the seconds of each step of a method on a scene."""
-        out = self.measured(scene, method)
-        return out.with_name(f"{out.name}.{SECONDS_FILE}")
+        return out.with_name(f"{out.name}.json")
 
 
 def measure_scene(run: BenchmarkRun, scene: GroundTruthScene, lpips: bool) -> None:
-    """Run and measure all methods on one scene; for a method that cannot run, write a file with the reason."""
+    """Run and measure all methods on one scene; write the reason for a method that cannot run."""
     console = Console()
     console.say(f"scene {scene.name}")
     composed = compose_scene(scene, run.work(scene), run.options, device=run.device, console=console)
     for method in run.methods:
-        out, reason = run.measured(scene, method), run.not_run_file(scene, method)
-        reason.unlink(missing_ok=True)
+        out, outcome = run.measured(scene, method), {}
         try:
             result, seconds = None, {}
             if method.pictures is None:
@@ -95,11 +86,11 @@ def measure_scene(run: BenchmarkRun, scene: GroundTruthScene, lpips: bool) -> No
                 scene.truth, scene.target, composed.target, out, result, shown, run.weights, lpips, run.device
             )
             perform_if_stale(step, console)
-            times = {**({} if method.pictures else composed.seconds), **seconds}
-            run.seconds_file(scene, method).write_text(json.dumps(times))
+            outcome["seconds"] = {**({} if method.pictures else composed.seconds), **seconds}
         except ValueError as error:
-            reason.parent.mkdir(parents=True, exist_ok=True)
-            reason.write_text(str(error))
+            outcome["reason"] = str(error)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        run.outcome_file(scene, method).write_text(json.dumps(outcome))
 
 
 def unmeasurable_metrics(folder: Path | None) -> dict[str, str]:
@@ -123,13 +114,14 @@ def collect_results(run: BenchmarkRun, missing: dict[str, str], failures: list[s
     for method in run.methods:
         for scene in run.scenes:
             out = run.measured(scene, method)
-            reason = run.not_run_file(scene, method)
-            if reason.is_file():
-                not_run.append(f"{method.name} on {scene.name} not run: {reason.read_text()}")
-            elif (out / METRICS_FILE).is_file():
+            file = run.outcome_file(scene, method)
+            if not file.is_file():
+                continue
+            if "reason" in (outcome := json.loads(file.read_text())):
+                not_run.append(f"{method.name} on {scene.name} not run: {outcome['reason']}")
+            else:
                 record = json.loads((out / METRICS_FILE).read_text())
-                times = json.loads(run.seconds_file(scene, method).read_text())
-                rows.append(Row(scene.name, method.name, record["values"], times))
+                rows.append(Row(scene.name, method.name, record["values"], outcome["seconds"]))
                 counts.add(len(record["views"]))
                 if (disagreement := record["values"].get("disagreement_truth")) is not None:
                     floors.append(disagreement)

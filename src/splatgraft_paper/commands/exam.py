@@ -22,15 +22,7 @@ from splatgraft.runtime.process import source_commit
 from splatgraft_paper.exam.measure import ROWS, SceneResult, evaluate_scene
 from splatgraft_paper.exam.scenes import SIZE, TRAINING_NUMBER, draw_scenes, read_scene, render_scene
 from splatgraft_paper.exam.summary import summarize_light, summarize_row, summary_markdown
-from splatgraft_paper.synthesis.benchmark import SCENES
 from splatgraft_paper.synthesis.jobs import RenderWorkers
-
-_RENAMED_ROWS = {
-    "told-new": "true-new-light",
-    "told-both": "true-lights",
-    "told-both-and-normals": "true-lights-and-normals",
-}
-"""Names of version 0.1.0 that are understood for one more version."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +34,10 @@ class Exam:
 
     number: Annotated[int | None, tyro.conf.Positional] = None
     """Number that the scenes' seeds are drawn from; 0 is for training and proves nothing."""
-    benchmark: bool = False
-    """Measure the nine benchmark scenes in the same size, instead of a number: a regression table."""
     scenes_from: Path | None = None
     """Folder of rendered scenes, instead of a number."""
     scenes: int | None = None
-    """Number of scenes; default: 12 of a number, all of --benchmark and --scenes-from."""
+    """Number of scenes; default: 12 of a number, all of --scenes-from."""
     out: Path | None = None
     """Folder for scenes/, work/ (reconstructions), results/, pictures/, exam.md and exam.json; default:
     build/exam/NUMBER. A picture has columns of held-out views: pasted, transfer, transfer with all truth, truth."""
@@ -63,12 +53,10 @@ class Exam:
 
     def execute(self, console: Console) -> int:
         """Render, measure and report; return 1 if a scene could not be made."""
-        given = [self.number is not None, self.benchmark, self.scenes_from is not None]
-        if sum(given) != 1:
-            raise ValueError(f"exam: expected a NUMBER, --benchmark or --scenes-from, found {sum(given)} of them")
-        rows = self._rows(console)
-        name = str(self.number) if given[0] else "benchmark" if given[1] else "given"
-        out = self.out or Path("build") / "exam" / name
+        if (self.number is None) == (self.scenes_from is None):
+            raise ValueError("exam: expected either a NUMBER or --scenes-from, found both or neither")
+        rows = self._rows()
+        out = self.out or Path("build") / "exam" / ("given" if self.number is None else str(self.number))
         results, failures = [], []
         for scene, make_folder in self._scene_folders(out, console):
             try:
@@ -80,15 +68,10 @@ class Exam:
         console.result(out / "exam.md")
         return 1 if failures else 0
 
-    def _rows(self, console: Console) -> tuple[str, ...]:
-        asked = []
-        for row in self.rows:
-            if row in _RENAMED_ROWS:
-                console.say(f"--rows: {row} is now {_RENAMED_ROWS[row]}; the next version drops the old name")
-            asked.append(_RENAMED_ROWS.get(row, row))
-        if unknown := [row for row in asked if row not in ROWS]:
+    def _rows(self) -> tuple[str, ...]:
+        if unknown := [row for row in self.rows if row not in ROWS]:
             raise ValueError(f"--rows: expected names among {', '.join(ROWS)}; found {unknown[0]}")
-        return tuple(row for row in ROWS if row in asked)
+        return tuple(row for row in ROWS if row in self.rows)
 
     @property
     def _options(self) -> ReconstructOptions:
@@ -102,8 +85,8 @@ class Exam:
                 yield folder.name, partial(Path, folder)
             return
         python = self.workers.python(console)
-        scenes = SCENES[: self.scenes] if self.number is None else draw_scenes(self.number, self.scenes or 12)
-        for which in scenes:
+        assert self.number is not None
+        for which in draw_scenes(self.number, self.scenes or 12):
             yield which.name, partial(render_scene, which, out, python, jobs=self.workers.processes)
 
     def _result(self, folder: Path, out: Path, rows: tuple[str, ...], console: Console) -> SceneResult:
@@ -157,10 +140,8 @@ class Exam:
         (out / "exam.md").write_text(text)
 
     def _title(self) -> str:
-        if self.scenes_from is not None:
-            return "Scenes that were given: no proof"
         if self.number is None:
-            return "The benchmark's nine scenes: no proof"
+            return "Scenes that were given: no proof"
         if self.number == TRAINING_NUMBER:
             return f"Number {self.number}, for training: no proof"
         return f"Held-out benchmark {self.number}"

@@ -6,9 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import torch
-
-from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.project.step import Positional, locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task
@@ -50,8 +47,6 @@ class SynthPairs:
     """Seed of all random choices."""
     maps: Path | None = None
     """Folder with .hdr and .exr environment maps; default: the maps that come with Blender."""
-    models: Path | None = None
-    """Folder with .glb, .gltf, .obj and .blend models that alternate with generated objects."""
     workers: RenderWorkers = field(default_factory=RenderWorkers)
 
     def execute(self, console: Console) -> int:
@@ -62,8 +57,7 @@ class SynthPairs:
             lights=pairs.PAPER_LIGHTS if self.paper else self.lights,
             seed=self.seed,
             size=read_render_size(self.size, self.samples),
-            maps=_files(self.maps, (".hdr", ".exr"), "--maps") or SUPPLIED_MAPS,
-            models=_files(self.models, (".glb", ".gltf", ".obj", ".blend"), "--models"),
+            maps=SUPPLIED_MAPS if self.maps is None else _maps(self.maps),
         )
         hours, cores = scenes * plan.cpu_seconds / 3600, os.cpu_count() or 1
         console.say(
@@ -86,12 +80,10 @@ class SynthPairs:
             return pairs.check_pairs(self.out, failures, console)
 
 
-def _files(folder: Path | None, suffixes: tuple[str, ...], option: str) -> tuple[str, ...]:
-    if folder is None:
-        return ()
-    found = sorted(str(path.resolve()) for path in folder.rglob("*") if path.suffix.lower() in suffixes)
+def _maps(folder: Path) -> tuple[str, ...]:
+    found = sorted(str(path.resolve()) for path in folder.rglob("*") if path.suffix.lower() in (".hdr", ".exr"))
     if not found:
-        raise ValueError(f"{option} {folder}: expected files that end in {', '.join(suffixes)}, found none")
+        raise ValueError(f"--maps {folder}: expected files that end in .hdr or .exr, found none")
     return tuple(found)
 
 
@@ -156,54 +148,6 @@ class SynthBenchmark:
         pixels = self.pixels or f"{named.render.width}x{named.render.height}"
         render = read_render_size(pixels, self.samples or named.render.samples)
         return benchmark.BenchmarkSize(render, self.views or named.views)
-
-
-@dataclass(frozen=True)
-class SynthCheck:
-    """Check every picture of a folder of pairs or benchmark scenes, and list the damaged and empty ones."""
-
-    out: Positional
-    """The folder that `paper synth pairs` or `paper synth benchmark` wrote."""
-
-    def execute(self, console: Console) -> int:
-        """Rewrite the manifest of pairs; 1 where something is faulty."""
-        scenes = sorted(path.parent for path in self.out.glob("*/scene.json"))
-        if not scenes:
-            return pairs.check_pairs(self.out, [], console)
-        faults = [wrong for wrong in map(benchmark.find_defect, scenes) if wrong]
-        console.say(f"{len(scenes) - len(faults)} of {len(scenes)} scenes are sound")
-        write_failures(self.out, faults, console)
-        return 1 if faults else 0
-
-
-@dataclass(frozen=True)
-class SynthSheet:
-    """Write one picture with all scenes of a folder."""
-
-    out: Positional
-    """The folder that `paper synth pairs` or `paper synth benchmark` wrote."""
-    picture: Path | None = None
-    """Where to write it; sheet.png in the folder where not given."""
-    columns: int = 6
-    """Pictures side by side."""
-    width: int = 240
-    """Pixels of one picture."""
-
-    def execute(self, console: Console) -> int:
-        """Write the sheet."""
-        paths = sorted(self.out.glob("*/object*/0002.png")) or sorted(self.out.glob("*/ground_truth/images/0002.png"))
-        paths = [path for path in paths if "_light" not in path.parent.name]
-        if not paths:
-            raise ValueError(f"{self.out}: expected rendered pairs or benchmark scenes, found none")
-        pictures = [read_rgb(path) for path in paths]
-        height = round(self.width * pictures[0].shape[0] / pictures[0].shape[1])
-        small = [resize(picture, self.width, height) for picture in pictures]
-        small += [torch.ones(height, self.width, 3)] * (-len(small) % self.columns)
-        rows = [torch.cat(small[i : i + self.columns], 1) for i in range(0, len(small), self.columns)]
-        target = self.picture or self.out / "sheet.png"
-        write_image(target, torch.cat(rows, 0))
-        console.result(target)
-        return 0
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from splatgraft_paper.benchmark.image_features import INCEPTION_FILE
 from splatgraft_paper.benchmark.methods import Method, MethodSettings
 from splatgraft_paper.benchmark.run import unmeasurable_metrics
 from splatgraft_paper.tables.data_ablation import DataAblation, measure_models
-from splatgraft_paper.tables.layout import PaperScene, download, find_scenes
+from splatgraft_paper.tables.layout import PaperScene, find_scenes
 from splatgraft_paper.tables.our_pictures import OurRun
 from splatgraft_paper.tables.paper_numbers import published_name
 from splatgraft_paper.tables.report import write_paper_report
@@ -46,8 +46,6 @@ class EvaluatePaper:
     """Names of scenes; default: all."""
     all_views: bool = False
     """Measure all views, not only the held-out ones."""
-    download: bool = False
-    """Download the data set into the folder first."""
     weights: Path | None = None
     """Folder with the weights of LPIPS and Inception; default: torch hub's cache."""
     harmonizer_weights: str | None = None
@@ -68,8 +66,6 @@ class EvaluatePaper:
 
     def execute(self, console: Console) -> int:
         """Measure and run what is missing and write the tables; return 1 if one of --methods could not run."""
-        if self.download:
-            download(self.data)
         scenes = self._chosen(find_scenes(self.data))
         missing_metrics = unmeasurable_metrics(self.weights)
         for name, reason in missing_metrics.items():

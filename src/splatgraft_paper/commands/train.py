@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -75,39 +75,30 @@ class TrainCompact:
     """Folder that `splatgraft paper synth pairs` rendered."""
     loop: CompactOptions = field(default_factory=CompactOptions)
     held_out: HeldOutOptions = field(default_factory=HeldOutOptions)
-    variants: int = 1
-    """Perturbed lights per pair; each adds 0.25 MB per pair at 240x160."""
-    start: Path | None = None
-    """Initial weights, a compact.safetensors, to continue a training with other pairs."""
     device: Device = "auto"
 
     def execute(self, console: Console) -> int:
         """Write the missing priors, train, write the weights."""
-        from splatgraft.harmonization.compact.network import SHIPPED, read_weights, write_weights
+        from splatgraft.harmonization.compact.network import SHIPPED, write_weights
 
         device = choose_device(self.device, console)
         samples = read_manifest(self.pairs)
         folders = sorted({sample.folder for sample in samples})
         self.out.mkdir(parents=True, exist_ok=True)
-        begin = None if self.start is None else read_weights(self.start)
-        loop = self.loop if begin is None else replace(self.loop, network=begin.size)
-        priors = [self.out / "priors" / str(variant) for variant in range(self.variants)]
-        for variant, folder in enumerate(priors):
-            with console.bar(f"light {variant + 1}") as progress:
-                write_priors(folders, folder, seed=loop.seed + variant, progress=progress)
+        with console.bar("priors") as progress:
+            write_priors(folders, self.out / "priors", seed=self.loop.seed, progress=progress)
         with console.bar("read") as progress:
-            pairs = CompactPairs(self.pairs, priors, self.held_out, progress)
+            pairs = CompactPairs(self.pairs, self.out / "priors", self.held_out, progress)
         console.say(f"{len(pairs.training)} pairs to train on, {len(pairs.validation)} held out")
         with console.bar("train") as progress:
-            task = CompactTask(pairs, loop, device, None if begin is None else begin.state_dict())
-            options = loop.loop(cpu=device.type == "cpu")
-            state = train(task, options, self.out, say=console.say, progress=progress)
+            options = self.loop.loop(cpu=device.type == "cpu")
+            state = train(CompactTask(pairs, self.loop, device), options, self.out, say=console.say, progress=progress)
         notes = {
             "pairs": json.dumps({"folders": [folder.name for folder in folders], **pairs.fingerprint()}),
-            "steps": str(loop.steps),
-            "seed": str(loop.seed),
+            "steps": str(self.loop.steps),
+            "seed": str(self.loop.seed),
         }
-        write_weights(self.out / SHIPPED.name, loop.network, state, notes)
+        write_weights(self.out / SHIPPED.name, self.loop.network, state, notes)
         console.say(f"{self.out / SHIPPED.name}")
         return 0
 

@@ -3,7 +3,6 @@
 import math
 import random
 from dataclasses import replace
-from pathlib import Path
 
 from splatgraft_paper.synthesis.furniture import Palette, tone
 from splatgraft_paper.synthesis.scene import Material, Number, Part, Pattern, Place, Shape, add, rotate_z
@@ -96,11 +95,3 @@ def make(seed: int, place: Place) -> tuple[Part, ...]:
     if rng.random() < 0.4:
         parts.append(_handle(rng, palette, widths[0], total * shares[0] / sum(shares)))
     return tuple(parts)
-
-
-def from_file(path: Path, place: Place) -> tuple[Part, ...]:
-    """Make an object from a model file, scaled to fit `place`, standing at the origin."""
-    height = min(place.height * 0.6, 0.5)
-    size = (1.9 * place.radius, 1.9 * place.radius, height)
-    any_material = Material("plain", (0.5, 0.5, 0.5))
-    return (Part("model", size, (0, 0, height / 2), any_material, path=str(path)),)

@@ -52,8 +52,6 @@ class PairPlan:
     size: RenderSize = field(default_factory=RenderSize)
     maps: tuple[str, ...] = SUPPLIED_MAPS
     """Environment maps: files, or names of maps that come with Blender."""
-    models: tuple[str, ...] = ()
-    """Model files, used for about half of the objects."""
 
     @property
     def targets(self) -> int:
@@ -80,10 +78,7 @@ def plan(options: PairPlan, number: int) -> Job:
     place = scene.places[0]
     things, heights = {}, []
     for i in range(options.objects):
-        if options.models and rng.random() < 0.5:
-            parts = objects.from_file(Path(rng.choice(options.models)), place)
-        else:
-            parts = objects.make(rng.randrange(2**31), place)
+        parts = objects.make(rng.randrange(2**31), place)
         heights.append(max(part.location[2] + part.size[2] / 2 for part in parts))
         things[f"object{i}"] = placed(parts, place.location, rng.uniform(0, 6.283))
     middle = add(place.location, (0, 0, 0.5 * max(heights)))

@@ -17,9 +17,7 @@ Pattern = Literal[
     "plain", "planks", "wood", "tiles", "brick", "fabric", "rug", "marble", "plaster", "speckle", "stripes", "checker",
     "painting", "grass", "metal",
 ]  # fmt: skip
-Shape = Literal[
-    "box", "cushion", "cylinder", "sphere", "turned", "extruded", "blob", "torus", "tuft", "foliage", "model"
-]
+Shape = Literal["box", "cushion", "cylinder", "sphere", "turned", "extruded", "blob", "torus", "tuft", "foliage"]
 
 
 @dataclass(frozen=True)
@@ -60,15 +58,13 @@ class Part:
     """Width of rounded edges, metres."""
     seed: int = 0
     """Seed of shapes with random details."""
-    path: str = ""
-    """File of a model: .glb, .gltf, .obj or .blend."""
 
 
 @dataclass(frozen=True)
 class Lamp:
     """A light source without geometry."""
 
-    kind: Literal["sun", "area", "point", "spot"]
+    kind: Literal["sun", "area", "point"]
     color: Color
     power: Number
     """Power, W; of a sun W/m^2."""
@@ -76,7 +72,7 @@ class Lamp:
     direction: Vector = (0.0, 0.0, -1.0)
     """Direction in which the light travels; not used by `point`."""
     size: Number = 0.1
-    """Side of an area, radius of a point or spot, metres; angular diameter of a sun, radians."""
+    """Side of an area, radius of a point, metres; angular diameter of a sun, radians."""
     height: Number = 0.0
     """Other side of a rectangular area, metres; 0 for a square."""
 

@@ -13,12 +13,11 @@ from splatgraft.project.step import Device, choose_device
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft_paper.benchmark.image_features import frechet_distance, inception_features
-from splatgraft_paper.tables.measure_pictures import KnownView, measure_picture
+from splatgraft_paper.tables.measure_pictures import measure_picture
 from splatgraft_paper.training.pairs import DataOptions, TrainingPair, crop_pair_to_size, open_training_data
 
 SOURCES = {"pairs": "Blender", "generated": "FLUX", "orida": "ORIDa"}
 """The paper's name of each source, by the source's option."""
-_KEYS = {"psnr": "psnr_whole", "ssim": "ssim_padded_whole", "lpips": "lpips_whole"}
 
 
 @dataclass(frozen=True)
@@ -58,13 +57,12 @@ def measure_models(run: DataAblation, console: Console) -> dict[str, dict[str, f
             rows, of_made, of_target = [], [], []
             for pair in pairs:
                 made = harmonizer.harmonize(_view_of(pair)).image.cpu()
-                rows.append(measure_picture(made, KnownView(truth=pair.target), perceptual))
+                rows.append(measure_picture(made, pair.target, perceptual))
                 if features is not None:
                     of_made.append(features([made]))
                     of_target.append(features([pair.target]))
-            for metric, key in _KEYS.items():
-                if metric in run.metrics:
-                    values[f"{metric} {source}"] = sum(row[key] for row in rows) / len(rows)
+            for metric in run.metrics - {"fid"}:
+                values[f"{metric} {source}"] = sum(row[metric] for row in rows) / len(rows)
             if features is not None:
                 values[f"fid {source}"] = frechet_distance(np.concatenate(of_made), np.concatenate(of_target))
             console.say(f"{model}, {source}: {values[f'psnr {source}']:.2f} dB on {len(pairs)} pairs")

@@ -1,10 +1,10 @@
 """The authors' published data set on disk: finds its scenes and their files, and matches pictures to views.
 
-The data set's card names the folders down to SCENE. It does not name the files below SCENE; the names here are ours, so
-files may have to be renamed:
+The data set is nviolante/dot3d on Hugging Face, CC-BY 4.0. Its card names the folders down to SCENE. It does not
+name the files below SCENE; the names here are ours, so files may have to be renamed:
 
     data_3d/{synthetic,real}/insertions/SCENE/      SCENE is OBJECT_in_BACKGROUND
-        gt/  masks/  background/  composite/        pictures VIEW.png: with the object, its masks, without it, pasted
+        gt/  background/  composite/                pictures VIEW.png: with the object, without it, pasted
         object.ply  background.ply                  trained Gaussians, the object at its place in the background
         transforms.json  placement.json             cameras of the views; pose of the object in the background
     data_3d/synthetic/scenes/{objects,backgrounds}/NAME     captures
@@ -24,15 +24,12 @@ import torch
 from splatgraft.core.images import IMAGE_SUFFIXES
 from splatgraft.core.posed_images import held_out
 from splatgraft.project.layout import PLACEMENT_FILE
-from splatgraft.runtime.hub import REPOSITORIES
 from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY
 from splatgraft_paper.tables.paper_numbers import published_name
 
 Kind = Literal["synthetic", "real", "rotation"]
-REPOSITORY = REPOSITORIES["dot3d"]
-"""Repository of the data set on Hugging Face, CC-BY 4.0."""
 _PARTS = ("data_3d", "data_rotation", "results_3d", "results_rotation")
-_PICTURES = {"truth": "gt", "masks": "masks", "background": "background", "composite": "composite"}
+_PICTURES = {"truth": "gt", "background": "background", "composite": "composite"}
 _FILES = {
     "object_scene": "object.ply",
     "target_scene": "background.ply",
@@ -50,28 +47,11 @@ class PaperScene:
     pose: str = ""
     """P0, P1 or P2 in the rotation experiment."""
     folders: Mapping[str, Path] = field(default_factory=dict)
-    """Folders of pictures by role: truth, composite, background, masks."""
+    """Folders of pictures by role: truth, composite, background."""
     files: Mapping[str, Path] = field(default_factory=dict)
     """Files by role: target_scene, object_scene (trained .ply), cameras, placement, source_capture, target_capture."""
     results: Mapping[str, Path] = field(default_factory=dict)
     """Folders of the authors' pictures by method."""
-
-
-def download(folder: Path) -> None:
-    """Download the data set from Hugging Face into `folder`; existing files are kept."""
-    import huggingface_hub
-
-    # the card shows the folders in dot3d_data/, but the repository may have them at the top
-    patterns = [f"{above}{part}/**" for part in _PARTS for above in ("", "*/")]
-    try:
-        huggingface_hub.snapshot_download(
-            REPOSITORY, repo_type="dataset", local_dir=str(folder), allow_patterns=patterns
-        )
-    except (OSError, ValueError, huggingface_hub.errors.HfHubHTTPError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(
-            f"https://huggingface.co/datasets/{REPOSITORY}: expected to fetch it, found {reason}"
-        ) from error
 
 
 def find_scenes(folder: Path) -> tuple[PaperScene, ...]:

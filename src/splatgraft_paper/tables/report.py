@@ -23,7 +23,6 @@ from splatgraft_paper.tables.run import METRIC_VERSIONS, PaperResults
 
 _FORMATS = {"psnr": "{:.2f}", "fid": "{:.2f}", "minutes": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
 _LESS_IS_BETTER = ("lpips", "fid", "kid", "flip", "minutes")
-_KEYS = {"psnr": "psnr_whole", "ssim": "ssim_padded_whole", "lpips": "lpips_whole", "flip": "flip_whole"}
 _COLUMNS = ("psnr", "ssim", "lpips", "fid", "kid", "flip")
 _EMPTY = "–"  # cell without a number; the notes give the reason
 _FIGURES: dict[Kind, tuple[str, ...]] = {
@@ -99,7 +98,7 @@ def paper_tables(results: PaperResults) -> list[Table]:
         scenes = [scene.name for scene in results.scenes if scene.kind == kind]
         rows = []
         for name in results.methods(kind):
-            values = {item.scene.name: item.values.get("psnr_whole") for item in results.of(kind, name)}
+            values = {item.scene.name: item.values.get("psnr") for item in results.of(kind, name)}
             rows.append((name, *(_text("psnr", values.get(scene)) for scene in scenes)))
         if rows:
             tables.append(Table(f"PSNR by scene: {kind}", ("method", *scenes), tuple(rows)))
@@ -151,13 +150,11 @@ def protocol_notes(results: PaperResults) -> list[str]:
     found = ", ".join(f"{count} of {SCENES[kind]} {kind}" for kind, count in kinds.items())
     resolutions = sorted({str(size) for item in measured for size in item.protocol.get("resolution", ())})  # pyright: ignore
     views = sorted({str(item.protocol["views"]) for item in measured})
-    masked = sum(bool(item.protocol.get("masks")) for item in measured)
     notes = [
         f"Scenes of the published data set found: {found}.",
         f"Views: {'; '.join(views) or 'none'} (the paper states this for the rotation experiment alone).",
         f"Resolution: {', '.join(resolutions) or 'none'}, that of the pictures, without resampling or cropping. Values "
         "are read as 8-bit sRGB in [0, 1] and not clamped further; renders of ours are clamped to [0, 1].",
-        f"Masks: {masked} of {len(measured)} measurements have masks; metrics of regions need them.",
         "Brackets: 95% bootstrap interval of the mean over scenes (10,000 resamples); one scene has none.",
         *(f"{name.upper()}: {text}." for name, text in METRIC_VERSIONS.items()),
         *(f"Not measured: {name}: {reason}" for name, reason in results.not_measured.items()),
@@ -188,13 +185,13 @@ def _published(table: PublishedTable, row: str, columns: Sequence[str]) -> list[
 
 
 def _measured(results: PaperResults, kind: Kind, method: str, pose: str = "") -> list[str]:
-    found = [item for item in results.of(kind, method, pose) if "psnr_whole" in item.values]
+    found = results.of(kind, method, pose)
     cells: list[str] = []
     for column in _COLUMNS:
         if column in ("fid", "kid"):
             cells.append(_text(column, results.pooled.get((kind, pose, method), {}).get(column)))
             continue
-        summary = summarize([item.values.get(_KEYS[column]) for item in found])
+        summary = summarize([item.values.get(column) for item in found])
         cells.append(_text(column, None if summary is None else summary.mean))
         if summary is not None and summary.scenes > 1:
             cells[-1] += f" [{_text(column, summary.low)}, {_text(column, summary.high)}]"

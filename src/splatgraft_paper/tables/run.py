@@ -27,8 +27,7 @@ from splatgraft_paper.tables.our_pictures import OurRun, our_pictures
 
 METRIC_VERSIONS = {
     "psnr": "whole images, peak 1, mean over views, then over scenes",
-    "ssim": "Wang 2004, 11x11 Gaussian window, zeros beyond the border, as 3DGS's metrics.py (ssim_whole in the JSON: "
-    "valid pixels only)",
+    "ssim": "Wang 2004, 11x11 Gaussian window, zeros beyond the border, as 3DGS's metrics.py",
     "flip": FLIP_VERSION,
     "lpips": f"Zhang 2018, version 0.1, VGG-16 ({VGG_FILE}, {HEADS_FILE}), pictures scaled to [-1, 1] as published "
     "(3DGS's metrics.py gives the network [0, 1]; which of the two the paper used is not said)",
@@ -44,7 +43,7 @@ class Measured:
 
     scene: PaperScene
     method: str
-    values: Mapping[str, float | None]
+    values: Mapping[str, float]
     """Mean over the measured views by metric."""
     protocol: Mapping[str, object]
     seconds: Mapping[str, float] = field(default_factory=dict)
@@ -89,9 +88,8 @@ def pooled_distances(
     """Compute FID and KID between a method's pictures of all its scenes and the true pictures."""
     out: dict[tuple[Kind, str, str], dict[str, float]] = {}
     for key, group in steps.items():
-        chosen = [views for step in group if "truth" in (views := step.views()).files]
-        paths = {role: [views.files[role][stem] for views in chosen for stem in views.matched]
-                 for role in ("pictures", "truth")}  # fmt: skip
+        chosen = [step.views().files for step in group]
+        paths = {role: [path for files in chosen for path in files[role].values()] for role in ("pictures", "truth")}
         if len(paths["truth"]) >= 2:
             found, wanted = (np.concatenate([features([read_rgb(path)]) for path in one]) for one in paths.values())
             out[key] = {"fid": frechet_distance(found, wanted), "kid": kernel_distance(found, wanted)}
@@ -162,12 +160,14 @@ def _run_ours(run: PaperRun, scene: PaperScene, method: Method, found: _Found) -
 def _measure(
     run: PaperRun, scene: PaperScene, method: str, folder: Path, found: _Found, seconds: Mapping[str, float] = {}
 ) -> None:
+    """Measure pictures of a scene whose truth is known."""
+    if "truth" not in scene.folders:
+        return
     out = run.ours.out / "measured" / scene.name / method.replace("/", "-")
-    weights = run.ours.methods.weights
-    step = MeasurePictures(folder, out, **scene.folders, weights=weights, lpips=found.lpips, all_views=run.all_views)
+    truth, weights = scene.folders["truth"], run.ours.methods.weights
+    step = MeasurePictures(folder, truth, out, weights, found.lpips, run.all_views)
     perform_if_stale(step, found.console)
     record = json.loads((out / METRICS_FILE).read_text())
     found.measured.append(Measured(scene, method, record["values"], record["protocol"], seconds))
-    if "truth" in scene.folders:
-        for pose in {"", scene.pose}:
-            found.pools.setdefault((scene.kind, pose, method), []).append(step)
+    for pose in {"", scene.pose}:
+        found.pools.setdefault((scene.kind, pose, method), []).append(step)

@@ -28,7 +28,7 @@ from splatgraft.runtime.files import atomic_write
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, Objective, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, TrainingData, crop_pair_to_size, open_training_data
-from splatgraft_paper.training.recipes import Recipe, TrainingCost, say_plan
+from splatgraft_paper.training.recipes import Recipe, say_plan
 from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 
 Times = Literal["uniform", "schnell"]
@@ -63,7 +63,7 @@ class FluxTrainingOptions:
     recipe: str | None = None
     """Default options: paper, without-blender, without-flux, without-orida, tiny or a .toml file."""
     plan: bool = False
-    """Print the plan without training: steps, hours, disk, licences."""
+    """Print the plan without training: steps, GPUs, data, licences."""
 
 
 class FluxObjective(Objective):
@@ -180,7 +180,7 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
     recipe = Recipe.read(options.recipe) if options.recipe else None
     processes = join_processes(options.loop)
     if options.plan or recipe:
-        say_plan(recipe, _cost(options, _known_config(options.base)), processes, console)
+        say_plan(recipe, options.loop, options.data.size, processes, console)
         if options.plan:
             return None
     data = open_training_data(options.data, options.loop.seed, recipe)
@@ -203,21 +203,3 @@ def _make_tiny_base(folder: Path, data: TrainingData, seed: int, console: Consol
     folder.parent.mkdir(parents=True, exist_ok=True)
     with console.bar("autoencoder") as progress, locked(folder.parent):
         write_tiny_base(folder, pictures, TinyBaseOptions(seed=seed), say=console.say, progress=progress)
-
-
-def _known_config(base: str) -> dict[str, Any]:
-    """Return a local transformer's config, or nothing for FLUX.1-schnell's, since a plan downloads no weights."""
-    if base == TINY:
-        tiny = TinyBaseOptions()
-        heads = {"num_attention_heads": tiny.heads, "attention_head_dim": tiny.head_width}
-        return {**heads, "num_layers": tiny.double_blocks, "num_single_layers": tiny.single_blocks}
-    return FluxFolder.open(Path(base)).config if Path(base).is_dir() else {}
-
-
-def _cost(options: FluxTrainingOptions, config: dict[str, Any]) -> TrainingCost:
-    width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
-    doubles, singles = config.get("num_layers", 19), config.get("num_single_layers", 38)
-    # 6 modulations per stream of a double block and 3 per single block are included, which inference bakes
-    parameters = width**2 * (36 * doubles + 15 * singles)
-    trained = options.lora * width * (36 * doubles + 20 * singles) if options.lora else parameters
-    return TrainingCost(options.loop, options.data.size, parameters, trained)

@@ -209,15 +209,6 @@ def train(
         return loop.result()
 
 
-def read_losses(path: Path) -> list[float]:
-    """Read the loss of each step, in order."""
-    try:
-        entries = [json.loads(line) for line in path.read_text().splitlines()]
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: expected the log of a training, found {error}") from error
-    return [entry["loss"] for entry in entries if "loss" in entry]
-
-
 def list_states(folder: Path) -> list[Path]:
     """List the complete states of a training's folder, oldest first."""
     return sorted(path for path in (folder / STATES).glob("[0-9]*") if (path / _JOB_FILE).is_file())

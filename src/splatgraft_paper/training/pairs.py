@@ -286,7 +286,7 @@ def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -
     width, height = parse_image_size(options.size, multiple_of=16)
     given = {"pairs": options.pairs, "generated": options.generated, "orida": options.orida}
     counts = {name: len(folders) for name, folders in given.items()}
-    chosen = recipe or Recipe.read("paper").of(counts)
+    chosen = recipe or Recipe.read("paper").for_folders(counts)
     weights = options.weights or chosen.weights(counts)
     folders = [
         open_rendered(Path(folder)) if name == "pairs" else open_relit(Path(folder))

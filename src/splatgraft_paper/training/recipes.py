@@ -1,23 +1,15 @@
-"""Recipes of trainings: the paper's experiments as TOML, their command-line options, and their estimated cost."""
+"""Recipes of trainings: the paper's experiments as TOML, their command-line options, and the plan of a training."""
 
 import argparse
-import math
 import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from splatgraft.runtime.console import Console
-from splatgraft_paper.synthesis.jobs import parse_image_size
 from splatgraft_paper.training.loop import LoopOptions
 
 _FOLDER = Path(__file__).with_name("recipe_files")
-# H100 seconds per pair at 704x496. FLUX, all weights: the paper's two days on four for 50K steps of 4 pairs (Sec. 5.3)
-_GPU_SECONDS_PER_PAIR = 48 * 3600 * 4 / (50_000 * 4)
-# Stable Diffusion 2, estimated: 4 x 1.1 TFLOP at the 52 TFLOP/s of the paper's harmoniser
-_REMOVAL_SECONDS_PER_PAIR = 0.08
-_PAPER_PIXELS = 704 * 496
-_LATENT_BYTES_PER_PIXEL = 16 / 64 * 2  # 16 channels of bfloat16 for 8 x 8 pixels
 
 
 @dataclass(frozen=True)
@@ -61,6 +53,8 @@ class Recipe:
             raise ValueError(f"--recipe: expected a file or one of {known}; found {name}")
         try:
             found = tomllib.loads(path.read_text())
+            if "recipe" in found:
+                return Recipe.read(found["recipe"])._without(found["without"], path.stem, found["title"])
             sources = [RecipeSource(option, **source) for option, source in found["sources"].items()]
             return Recipe(
                 name=path.stem,
@@ -74,6 +68,13 @@ class Recipe:
         except (tomllib.TOMLDecodeError, KeyError, TypeError) as error:
             raise ValueError(f"{path}: expected a recipe with the keys of the shipped ones, found {error}") from error
 
+    def _without(self, option: str, name: str, title: str) -> "Recipe":
+        """Drop one source and its licence, for an ablation of the data."""
+        sources = tuple(source for source in self.sources if source.option != option)
+        dropped = {source.name for source in self.sources if source.option == option}
+        licences = {key: text for key, text in self.licences.items() if key not in dropped}
+        return replace(self, name=name, title=title, sources=sources, licences=licences)
+
     def words(self) -> list[str]:
         """Convert the options to command-line arguments, which later arguments replace."""
         words = []
@@ -84,7 +85,7 @@ class Recipe:
                 words += [f"--{name}", str(value)]
         return words
 
-    def of(self, folders: dict[str, int]) -> "Recipe":
+    def for_folders(self, folders: dict[str, int]) -> "Recipe":
         """Drop the sources without folders."""
         return replace(self, sources=tuple(source for source in self.sources if folders.get(source.option)))
 
@@ -100,63 +101,25 @@ class Recipe:
         return tuple(share for folder in shares for share in folder)
 
 
-@dataclass(frozen=True)
-class TrainingCost:
-    """Sizes that determine the time and disk space of a training."""
-
-    loop: LoopOptions
-    size: str
-    """Pixels, WIDTHxHEIGHT."""
-    parameters: int
-    trained: int
-    """Number of trained parameters; smaller with a low-rank adaptation."""
-    removal: bool = False
-    """Whether the object removal is trained instead of FLUX."""
-
-    def hours(self, processes: int) -> float:
-        """Estimate the hours of a training on H100 cards."""
-        pixels = math.prod(parse_image_size(self.size))
-        each = _REMOVAL_SECONDS_PER_PAIR if self.removal else _GPU_SECONDS_PER_PAIR * self.parameters / 11.8e9
-        return self.loop.steps * self.loop.batch * each * pixels / _PAPER_PIXELS / processes / 3600
-
-    @property
-    def state_bytes(self) -> int:
-        """Bytes of three states, two kept and one being written: weights, Adam's moments, the average."""
-        return 3 * self.trained * (4 + 8 + 4 * (self.loop.ema > 0))
-
-
-def say_plan(recipe: Recipe | None, cost: TrainingCost, processes: Any, console: Console) -> None:
-    """Print the plan of a training: steps, hours and disk; with a recipe, also data and licences.
+def say_plan(recipe: Recipe | None, loop: LoopOptions, size: str, processes: Any, console: Console) -> None:
+    """Print the plan of a training: steps, size and GPUs; with a recipe, also data and licences.
 
     `processes` is accelerate's Accelerator; without a launcher, the plan is for the recipe's number of processes.
     """
+    if not processes.is_main_process:
+        return
     count = recipe.processes if recipe and processes.num_processes == 1 else processes.num_processes
-    if processes.is_main_process:
-        for line in _plan(recipe, cost, count):
-            console.say(line)
-
-
-def _plan(recipe: Recipe | None, cost: TrainingCost, processes: int) -> list[str]:
-    loop, sources = cost.loop, recipe.sources if recipe else ()
-    pictures = sum(2 * source.targets + source.composites for source in sources)
-    latents = round(pictures * math.prod(parse_image_size(cost.size)) * _LATENT_BYTES_PER_PIXEL)
-    basis = "4 x 1.1 TFLOP a pair at 52 TFLOP/s"
-    basis = basis if cost.removal else "the paper's two days, scaled by pairs, pixels and weights"
-    disk = f"{_size(4 * cost.parameters)} for the model, {_size(cost.state_bytes)} for states"
-    lines = [
-        f"plan: {loop.steps:,} steps of {loop.batch} pairs at {cost.size}, Adam at {loop.rate:g}, on {processes} GPUs",
-        f"hours: about {cost.hours(processes):.2g} on {processes} H100 (an estimate: {basis})",
-        f"disk: {disk}, {_size(latents) if sources else 'half a byte a pixel'} for latents",
-    ]
-    if recipe is None:
-        return lines
-    total = sum(source.weight for source in sources)
-    for source in sources:
-        drawn = f"{source.weight / total:.0%} of the drawn pairs"
-        counts = f"{source.targets:,} targets and {source.composites:,} composites"
-        lines.append(f"data: {source.name} (--{source.option}), {counts}, {drawn}")
-    licences = [f"licence: {name}: {licence}" for name, licence in recipe.licences.items()]
-    return [f"recipe {recipe.name}: {recipe.title}", *lines, *licences]
+    lines = [f"plan: {loop.steps:,} steps of {loop.batch} pairs at {size}, Adam at {loop.rate:g}, on {count} GPUs"]
+    if recipe is not None:
+        lines.insert(0, f"recipe {recipe.name}: {recipe.title}")
+        total = sum(source.weight for source in recipe.sources)
+        for source in recipe.sources:
+            drawn = f"{source.weight / total:.0%} of the drawn pairs"
+            counts = f"{source.targets:,} targets and {source.composites:,} composites"
+            lines.append(f"data: {source.name} (--{source.option}), {counts}, {drawn}")
+        lines += [f"licence: {name}: {licence}" for name, licence in recipe.licences.items()]
+    for line in lines:
+        console.say(line)
 
 
 def arguments_with_recipe(command: str, words: list[str]) -> list[str]:
@@ -172,9 +135,3 @@ def arguments_with_recipe(command: str, words: list[str]) -> list[str]:
         known = ", ".join(one.name for one in found if one.command == command)
         raise ValueError(f"--recipe: expected a recipe of `{command}` ({known}), found {name} of `{recipe.command}`")
     return [*recipe.words(), *words]
-
-
-def _size(count: int) -> str:
-    if count >= 1e8:
-        return f"{count / 1e9:.{0 if count >= 1e10 else 1}f} GB"
-    return f"{count / 1e6:.0f} MB"

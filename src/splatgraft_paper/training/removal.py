@@ -21,11 +21,10 @@ from splatgraft.runtime.console import Console
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, Objective, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, open_training_data
-from splatgraft_paper.training.recipes import Recipe, TrainingCost, say_plan
+from splatgraft_paper.training.recipes import Recipe, say_plan
 
 CONDITIONS = 2
 """Number of images that condition the network: the image with the object, and the mask."""
-_PARAMETERS = 865_000_000  # number of parameters of Stable Diffusion 2's UNet
 _MULTIPLE = 64  # pixels; factors of 8 in the autoencoder and 8 in the UNet
 
 
@@ -42,7 +41,7 @@ class RemovalTrainingOptions:
     recipe: str | None = None
     """Default options: removal or a .toml file."""
     plan: bool = False
-    """Print the plan without training: steps, hours, disk, licences."""
+    """Print the plan without training: steps, GPUs, data, licences."""
 
 
 class RemovalObjective(Objective):
@@ -163,8 +162,7 @@ def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) 
     """Train the object removal, return its folder; None in all but the first process, or if only planned."""
     loop, recipe = options.loop, Recipe.read(options.recipe) if options.recipe else None
     if options.plan or recipe:
-        cost = TrainingCost(loop, options.data.size, _PARAMETERS, _PARAMETERS, removal=True)
-        say_plan(recipe, cost, join_processes(loop), console)
+        say_plan(recipe, loop, options.data.size, join_processes(loop), console)
         if options.plan:
             return None
     data = open_training_data(options.data, loop.seed, recipe)

@@ -9,7 +9,7 @@ from itertools import pairwise
 import bmesh
 import bpy
 import materials  # a module of this folder, which the worker adds to the path
-from mathutils import Euler, Matrix, Vector, noise
+from mathutils import Euler, Vector, noise
 
 
 def clear():
@@ -145,50 +145,8 @@ _SHAPES = {
 _SMOOTH = {"cushion", "cylinder", "sphere", "turned", "blob", "torus", "tuft"}
 
 
-def _model(part):
-    """Load all meshes of a model file, scaled to fit the part's box and standing on its bottom."""
-    before = set(bpy.data.objects)
-    if not os.path.isfile(part["path"]):
-        raise ValueError(f"{part['path']}: expected a model file, found none")
-    suffix = os.path.splitext(part["path"])[1].lower()
-    if suffix in (".glb", ".gltf"):
-        bpy.ops.import_scene.gltf(filepath=part["path"])
-    elif suffix == ".obj":
-        bpy.ops.wm.obj_import(filepath=part["path"])
-    elif suffix == ".blend":
-        with bpy.data.libraries.load(part["path"]) as (source, wanted):
-            wanted.objects = source.objects
-        for thing in wanted.objects:
-            bpy.context.scene.collection.objects.link(thing)
-    else:
-        raise ValueError(f"{part['path']}: expected a .glb, .gltf, .obj or .blend model, found '{suffix}'")
-    new = [o for o in bpy.data.objects if o not in before]
-    meshes = [o for o in new if o.type == "MESH"]
-    if not meshes:
-        raise ValueError(f"{part['path']}: expected a model with meshes, found none")
-    bpy.context.view_layer.update()
-    corners = [o.matrix_world @ Vector(c) for o in meshes for c in o.bound_box]
-    low = Vector(min(c[i] for c in corners) for i in range(3))
-    high = Vector(max(c[i] for c in corners) for i in range(3))
-    scale = min(part["size"][i] / max(high[i] - low[i], 1e-6) for i in range(3))
-    place = Matrix.LocRotScale(Vector(part["location"]), Euler(part["rotation"]), Vector((scale,) * 3))
-    # a wide model does not fill the height of its box, so it is lowered to the box's bottom
-    lowered = Vector((0, 0, (part["size"][2] / scale - (high[2] - low[2])) / 2))
-    matrix = place @ Matrix.Translation(-(low + high) / 2 - lowered)
-    worlds = {o: o.matrix_world.copy() for o in meshes}
-    for thing in meshes:
-        thing.parent = None
-        thing.matrix_world = matrix @ worlds[thing]
-    return meshes
-
-
 def add_part(part, name, meshes):
-    """Add one part and return its Blender objects, several for a model of several meshes.
-
-    `meshes` caches geometry and materials, so that equal parts share them.
-    """
-    if part["shape"] == "model":
-        return _model(part)
+    """Add one part and return its Blender object; `meshes` caches geometry and materials of equal parts."""
     key = json.dumps({k: v for k, v in part.items() if k not in ("location", "rotation")}, sort_keys=True)
     if key in meshes:
         thing = bpy.data.objects.new(name, meshes[key])
@@ -206,7 +164,7 @@ def add_part(part, name, meshes):
     if part["shape"] in ("turned", "blob") and max(part["size"]) < 0.8:
         smooth = thing.modifiers.new("smooth", "SUBSURF")
         smooth.levels = smooth.render_levels = 1
-    return [thing]
+    return thing
 
 
 def _smooth(thing, part):

@@ -28,11 +28,11 @@ def _populate(job):
     scene_builder.clear()
     scene_things, objects, meshes = [], {}, {}
     for i, part in enumerate(job["scene"]["parts"]):
-        scene_things += scene_builder.add_part(part, f"part{i:03d}", meshes)
+        scene_things.append(scene_builder.add_part(part, f"part{i:03d}", meshes))
     for i, lamp in enumerate(job["scene"]["lamps"]):
         scene_things.append(scene_builder.add_lamp(lamp, f"lamp{i:02d}"))
     for key, parts in job["objects"].items():
-        things = [thing for part in parts for thing in scene_builder.add_part(part, key, meshes)]
+        things = [scene_builder.add_part(part, key, meshes) for part in parts]
         for i, thing in enumerate(things):
             thing.name = f"{key}_{i:03d}"
         objects[key] = things

@@ -5,7 +5,6 @@ and step determine the pairs of a step and their augmentation.
 """
 
 import math
-import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -55,18 +54,13 @@ class CompactOptions:
 class CompactTask:
     """The compact network on rendered pairs, as a task of the training loop."""
 
-    def __init__(
-        self, pairs: CompactPairs, options: CompactOptions, device: torch.device, begin: dict[str, Tensor] | None = None
-    ) -> None:
-        """Make the network; `begin` has its initial weights, random if None."""
+    def __init__(self, pairs: CompactPairs, options: CompactOptions, device: torch.device) -> None:
+        """Make the network with random weights."""
         torch.manual_seed(options.seed)
         self._pairs, self._options, self._device = pairs, options, device
         self.network: nn.Module = CompactNetwork(options.network)
-        if begin is not None:
-            self.network.load_state_dict(begin)
         settings: dict[str, Any] = {name: asdict(options)[name] for name in ("steps", "decay", "size", "network")}
-        start = 0.0 if begin is None else sum(float(tensor.double().abs().sum()) for tensor in begin.values())
-        self.fingerprint: Mapping[str, Any] = {**settings, "pairs": pairs.fingerprint(), "begin": start}
+        self.fingerprint: Mapping[str, Any] = {**settings, "pairs": pairs.fingerprint()}
 
     def optimizer(self) -> torch.optim.Optimizer:
         """Make AdamW; biases and scales do not decay."""
@@ -88,9 +82,8 @@ class CompactTask:
         pairs, seed = self._pairs, self._options.seed
         epoch, place = divmod(position, len(pairs.training))
         order = torch.randperm(len(pairs.training), generator=torch.Generator().manual_seed(seed * 7919 + epoch))
-        name = f"compact-{seed}-{position}"
-        variant = random.Random(name).randrange(pairs.variants)
-        return augment(*pairs.read(pairs.training[int(order[place])], variant), self._options.size, name)
+        whole = pairs.read(pairs.training[int(order[place])])
+        return augment(*whole, self._options.size, f"compact-{seed}-{position}")
 
     def loss(self, network: Callable[..., Any], items: Sequence[tuple[CompactInput, Tensor]]) -> Float[Tensor, ""]:
         """Compute the loss of a batch of views."""
@@ -114,8 +107,7 @@ class CompactTask:
         totals: dict[str, float] = {}
         rows = []
         for number, index in enumerate(chosen):
-            whole = pairs.read(index, number % pairs.variants)
-            view, truth = augment(*whole, self._options.size, f"validation-{number}")
+            view, truth = augment(*pairs.read(index), self._options.size, f"validation-{number}")
             view, truth = view.to(self._device), truth.to(self._device)
             output = network(view.channels()).float()
             _, errors, prior_errors = compact_loss(view, output, truth)

@@ -45,41 +45,38 @@ class CompactPair:
     held_out: bool
     arrays: Mapping[str, np.ndarray]
     """Pictures: target, background, relit (RGBA), mask: 8-bit sRGB; depth: float16; normal: int8, camera's frame."""
-    log_ratios: Sequence[Float[np.ndarray, "h w 3"]]
-    """Log ratios of the prior, one per variant of the perturbed lights, float16."""
-    confidences: Sequence[float]
-    """Confidences of these priors."""
+    log_ratio: Float[np.ndarray, "h w 3"]
+    """Log ratio of the prior, float16."""
+    confidence: float
+    """Confidence of the prior."""
 
 
 class CompactPairs:
     """All pairs of a folder with priors, decoded."""
 
-    def __init__(
-        self, pairs: Path, priors: Sequence[Path], held_out: HeldOutOptions, progress: Progress = silent
-    ) -> None:
-        """Read all rendered pairs, about 0.6 MB each at 240x160, and their priors, one folder per variant."""
-        self.variants = len(priors)
+    def __init__(self, pairs: Path, priors: Path, held_out: HeldOutOptions, progress: Progress = silent) -> None:
+        """Read all rendered pairs, about 0.6 MB each at 240x160, and the priors that `write_priors` wrote."""
         self.entries: list[CompactPair] = []
         samples = read_manifest(pairs)
         folders = sorted({sample.folder for sample in samples})
         for number, folder in enumerate(folders):
             scene_held_out = held_out.every > 0 and number % held_out.every == held_out.every - 1
-            paths = [found / f"{folder.name}.npz" for found in priors]
-            if all(path.is_file() for path in paths):
+            path = priors / f"{folder.name}.npz"
+            if path.is_file():
                 own = [sample for sample in samples if sample.folder == folder]
-                self.entries += _read_folder(folder, own, paths, None if scene_held_out else held_out)
+                self.entries += _read_folder(folder, own, path, None if scene_held_out else held_out)
             progress(number + 1, len(folders), folder.name)
         if not self.entries:
-            raise ValueError(f"{', '.join(map(str, priors))}: expected priors of the pairs in {pairs}, found none")
+            raise ValueError(f"{priors}: expected priors of the pairs in {pairs}, found none")
         self.training = [i for i, entry in enumerate(self.entries) if not entry.held_out]
         self.validation = [i for i, entry in enumerate(self.entries) if entry.held_out]
 
     def fingerprint(self) -> dict[str, int]:
         """Return the counts that must be equal in a resumed training."""
-        return {"training": len(self.training), "validation": len(self.validation), "variants": self.variants}
+        return {"training": len(self.training), "validation": len(self.validation)}
 
-    def read(self, index: int, variant: int = 0) -> tuple[CompactInput, Float[Tensor, "1 3 h w"]]:
-        """Read a pair at full size with one of its priors, and the truth in linear light.
+    def read(self, index: int) -> tuple[CompactInput, Float[Tensor, "1 3 h w"]]:
+        """Read a pair at full size with its prior, and the truth in linear light.
 
         The composite's object keeps the exposure of its own light; it is not normalised as in the paper.
         """
@@ -93,23 +90,24 @@ class CompactPairs:
             composite=_channels_first(composite),
             background=_channels_first(_LINEAR[background.int()]),
             mask=covered[..., 0][None, None],
-            log_ratio=_channels_first(torch.from_numpy(entry.log_ratios[variant]).float()),
+            log_ratio=_channels_first(torch.from_numpy(entry.log_ratio).float()),
             depth=relative_depth(arrays["depth"].float(), mask)[None, None],
             normal=_channels_first(arrays["normal"].float() / 127),
-            prior_confidence=torch.tensor([entry.confidences[variant]]),
+            prior_confidence=torch.tensor([entry.confidence]),
         )
         return view, _channels_first(_LINEAR[arrays["target"].int()])
 
 
 def _read_folder(
-    folder: Path, samples: Sequence[PairSample], priors: Sequence[Path], held_out: HeldOutOptions | None
+    folder: Path, samples: Sequence[PairSample], priors: Path, held_out: HeldOutOptions | None
 ) -> list[CompactPair]:
     """Read the pairs of a scene; `held_out` is None if the whole scene is held out."""
     job = json.loads((folder / "job.json").read_text())
     cameras = rendered_cameras(folder, tuple(f"{i:04d}" for i in range(len(job["cameras"]))))
     worlds = {take["name"]: take["world"].get("path", "") for take in job["takes"] if take.get("world")}
     picture = cache(_read_image)
-    variants = [_read_priors(path) for path in priors]
+    with np.load(priors, allow_pickle=False) as arrays:
+        found = {name: arrays[name] for name in arrays.files}
     pairs = []
 
     @cache
@@ -123,9 +121,8 @@ def _read_folder(
 
     for sample in samples:
         take = f"{sample.object}_{sample.light}"
-        for path, found in zip(priors, variants, strict=True):
-            if take not in found:
-                raise ValueError(f"{path}: expected a prior of {take}, found none; remove the file to remake it")
+        if take not in found:
+            raise ValueError(f"{priors}: expected a prior of {take}, found none; remove the file to remake it")
         patterns = {part["material"]["pattern"] for part in job["objects"][sample.object]}
         is_held_out = held_out is None or bool(patterns & set(held_out.materials)) or worlds[take] in held_out.lights
         mask = picture(sample.path(sample.object, "mask"))
@@ -140,15 +137,9 @@ def _read_folder(
             "depth": depth,
             "normal": normal,
         }
-        ratios = [found[take][sample.camera] for found in variants]
-        confidences = [float(found[f"{take}_trust"]) for found in variants]
-        pairs.append(CompactPair(folder.name, sample.light, is_held_out, arrays, ratios, confidences))
+        ratio, confidence = found[take][sample.camera], float(found[f"{take}_trust"])
+        pairs.append(CompactPair(folder.name, sample.light, is_held_out, arrays, ratio, confidence))
     return pairs
-
-
-def _read_priors(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
 
 
 def _channels_first(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "1 3 h w"]:
