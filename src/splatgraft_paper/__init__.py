@@ -1,4 +1,4 @@
-"""The experiments of the paper: synthetic data, training, methods by others, the benchmark and the tables.
+"""Experiments of the paper: synthetic data, training, methods by others, the benchmark and the tables.
 
-It imports splatgraft; splatgraft never imports it. Its commands are `splatgraft paper ...`.
+This package imports splatgraft; splatgraft never imports it. Its commands are `splatgraft paper ...`.
 """

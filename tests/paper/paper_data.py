@@ -27,15 +27,14 @@ def write_data(root):
     synthetic, results = root / "data_3d/synthetic/insertions", root / "results_3d"
     rotation = root / "data_rotation/bathroom"
     for stem in STEMS:
-        truth, background, mask, composite = parts_of_view(stem)
+        truth, background, _, composite = parts_of_view(stem)
         half = 0.5 * (truth + composite)
         for scene in (PLAIN, OTHER):
-            for name, image in (("gt", truth), ("masks", mask), ("background", background), ("composite", composite)):
+            for name, image in (("gt", truth), ("background", background), ("composite", composite)):
                 put(synthetic / scene / name / f"{stem}.png", image)
             put(results / "synthetic" / "ours" / scene / f"{stem}.png", half)
             put(results / "synthetic" / "gs_ir" / scene / f"{stem}.png", composite)
-        for name, image in (("composite", composite), ("masks", mask)):
-            put(root / "data_3d/real/insertions" / REAL / name / f"{stem}.png", image)
+        put(root / "data_3d/real/insertions" / REAL / "composite" / f"{stem}.png", composite)
         put(results / "real" / "ours" / REAL / f"{stem}.png", half)
         for pose in ("rot_000", "rot_120", "rot_240"):
             put(rotation / pose / "gt" / f"{stem}.png", truth)

@@ -1,12 +1,11 @@
-"""The contents of the authors' data set, the paper's numbers, and the metrics that a view's files allow."""
+"""Scenes of the authors' data set, matching of pictures to views, and the paper's numbers."""
 
-import huggingface_hub
 import pytest
 import torch
 from paper_data import put
 
-from splatgraft_paper.tables.layout import download, find_scenes, held_out_stems, match_views, pictures
-from splatgraft_paper.tables.measure_pictures import KnownView, measure_picture, padded_ssim
+from splatgraft_paper.tables.layout import find_scenes, held_out_stems, match_views, pictures
+from splatgraft_paper.tables.measure_pictures import padded_ssim
 from splatgraft_paper.tables.paper_numbers import ROTATION, SYNTHETIC, UPDATES, published_name
 
 GREY = torch.full((12, 16, 3), 0.5)
@@ -32,7 +31,7 @@ def test_pictures_are_matched_by_name_then_by_number_and_never_by_chance(tmp_pat
 
 
 def test_scenes_their_captures_and_the_authors_pictures_are_found_by_the_layout(tmp_path):
-    for role in ("gt", "masks"):
+    for role in ("gt", "background"):
         put(tmp_path / "data_3d/synthetic/insertions/truck_in_garden" / role / "0.png", GREY)
     put(tmp_path / "data_3d/synthetic/scenes/objects/truck/images/0.png", GREY)
     put(tmp_path / "results_3d/synthetic/3dgs_dr/truck_in_garden/0.png", GREY)
@@ -40,7 +39,7 @@ def test_scenes_their_captures_and_the_authors_pictures_are_found_by_the_layout(
         put(tmp_path / "data_rotation/yard" / pose / "gt" / "0.png", GREY)
         put(tmp_path / "results_rotation/ours/yard" / pose / "0.png", GREY)
     plain, first, second = find_scenes(tmp_path)
-    assert set(plain.folders) == {"truth", "masks"}
+    assert set(plain.folders) == {"truth", "background"}
     assert set(plain.files) == {"source_capture"}
     assert list(plain.results) == ["3DGS-DR"]
     assert [(scene.name, scene.pose) for scene in (first, second)] == [("yard_00", "P0"), ("yard_90", "P1")]
@@ -61,19 +60,6 @@ def test_the_papers_numbers_are_whole_rows():
     assert SYNTHETIC.value("Ours", "psnr") == 22.53
 
 
-def test_metrics_follow_what_is_known_of_a_view():
-    generator = torch.Generator().manual_seed(0)
-    truth = torch.rand(40, 50, 3, generator=generator)
-    mask = torch.zeros(40, 50)
-    mask[10:30, 10:30] = 1
-    image = (truth * 0.9).clamp(0, 1)
-    assert "psnr_object" not in measure_picture(image, KnownView(truth=truth))
-    with_mask = measure_picture(image, KnownView(truth=truth, mask=mask))
-    assert "psnr_object" in with_mask
-    assert "psnr_shadow" not in with_mask
-    assert "shadow_ratio_rmse" in measure_picture(image, KnownView(truth=truth, mask=mask, background=truth))
-
-
 def test_padded_ssim_counts_border_pixels_beside_zeros():
     a, b = torch.rand(30, 40, 3), torch.rand(30, 40, 3)
     from skimage.metrics import structural_similarity
@@ -86,20 +72,3 @@ def test_padded_ssim_counts_border_pixels_beside_zeros():
     )
     # float32 against float64: 1e-6 of values up to 1, divided by the constant 0.03^2 at worst
     assert float(padded_ssim(a, b)) == pytest.approx(float(wanted[5:-5, 5:-5].mean()), abs=1e-4)
-
-
-def test_scenes_and_results_are_fetched_wherever_the_card_puts_them(tmp_path, monkeypatch):
-    asked = {}
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda repo, **how: asked.update(repo=repo, **how))
-    download(tmp_path)
-    assert (asked["repo"], asked["repo_type"]) == ("nviolante/dot3d", "dataset")
-    wanted = ["dot3d_data/results_3d/real/ours/truck_in_garden/0000.png", "results_rotation/ours/bathroom/00/0.png"]
-    found = huggingface_hub.utils.filter_repo_objects([*wanted, "other/0.png"], allow_patterns=asked["allow_patterns"])
-    assert list(found) == wanted
-
-    def unreachable(*_, **__):
-        raise OSError("no route\nto host")
-
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", unreachable)
-    with pytest.raises(ValueError, match=r"datasets/nviolante/dot3d: expected to fetch it, found no route to host$"):
-        download(tmp_path)

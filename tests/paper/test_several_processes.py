@@ -17,8 +17,9 @@ pytest.importorskip("diffusers")
 from safetensors.torch import load_file
 from tiny_models import flux_folder, quiet
 from tiny_pairs import relit_folder
+from tiny_training import read_losses
 
-from splatgraft_paper.training.loop import LOG_FILE, list_states, read_losses
+from splatgraft_paper.training.loop import LOG_FILE, list_states
 
 pytestmark = [*quiet, pytest.mark.long, pytest.mark.filterwarnings("ignore::UserWarning")]
 PROGRAM = Path(__file__).with_name("tiny_training.py")

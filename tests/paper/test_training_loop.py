@@ -15,13 +15,13 @@ pytest.importorskip("diffusers")
 
 from tiny_models import CHANNELS, quiet, removal_folder
 from tiny_pairs import rendered_folder
-from tiny_training import QUICK, measured_by, run_of, silent, training
+from tiny_training import QUICK, measured_by, read_losses, run_of, silent, training
 
 from splatgraft.core.images import read_rgb
 from splatgraft.harmonization import FluxOptions, HarmonizerInputs, make_harmonizer
 from splatgraft.harmonization.flux.tensor_file import write_tensors
 from splatgraft_paper.training.flux import FluxObjective, FluxTrainingOptions
-from splatgraft_paper.training.loop import LOG_FILE, list_states, read_losses
+from splatgraft_paper.training.loop import LOG_FILE, list_states
 from splatgraft_paper.training.pairs import crop_pair_to_size, open_relit, open_rendered
 from splatgraft_paper.training.removal import RemovalObjective
 

@@ -83,6 +83,6 @@ def test_an_object_of_unknown_origin_is_pasted_and_said():
     composite = Composite(new, (PlacedObject(ball, Similarity.identity()),), torch.zeros(new.count, dtype=torch.bool))
     relit, report = relight_by_irradiance_ratio(composite, sources=[None])
     assert torch.equal(relit.objects[0].gaussians.sh, ball.sh)
-    assert "not known. It is pasted as it is." in report[0].text
+    assert "not known. It is pasted with its captured colours." in report[0].text
     with pytest.raises(ValueError, match="expected 1 source scenes, found 0"):
         relight_by_irradiance_ratio(composite, sources=[])

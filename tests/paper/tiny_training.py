@@ -26,6 +26,12 @@ QUICK = LoopOptions(
 )
 
 
+def read_losses(path):
+    """Read the loss of each step, in order."""
+    entries = [json.loads(line) for line in path.read_text().splitlines()]
+    return [entry["loss"] for entry in entries if "loss" in entry]
+
+
 def silent(*words):
     pass
 

@@ -1,1 +1,1 @@
-"""Runs of the benchmark: scenes are composed, methods applied to them, and their pictures measured."""
+"""The benchmark: composes scenes with ground truth, runs methods on them and measures their pictures."""

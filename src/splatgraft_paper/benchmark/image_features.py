@@ -1,7 +1,7 @@
-"""FID and KID of sets of images, from the Inception features of torch-fidelity (those of the published FID).
+"""FID and KID between sets of images, from torch-fidelity's Inception features, which the published FID used.
 
-torch-fidelity needs a torchvision that fits torch and is therefore no optional dependency of this package. Its weights
-are read from a given folder, never downloaded.
+torch-fidelity is no optional dependency of this package, because it needs a torchvision that fits torch. Its weights
+are read from a given folder and never downloaded.
 """
 
 import math
@@ -15,13 +15,12 @@ from torch import Tensor
 
 INCEPTION_FILE = "weights-inception-2015-12-05-6726825d.pth"
 Features = Callable[[Sequence[Float[Tensor, "h w 3"]]], Float[np.ndarray, "n d"]]
-"""Images, sRGB in [0, 1], to one row of features each."""
-_KID_SUBSETS, _KID_SIZE = 100, 50
-"""Random subsets of KID, and images per subset."""
+"""Function from images, sRGB in [0, 1], to one row of features per image."""
+_KID_SUBSETS, _KID_SIZE = 100, 50  # random subsets of KID, images per subset
 
 
 def inception_features(folder: Path | None) -> Features:
-    """The 2048 features of the published FID; weights are read from `folder`, or from torch hub's cache where None."""
+    """Load the network of the published FID with its 2048 features from `folder`, or from torch hub's cache if None."""
     path = (Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder) / INCEPTION_FILE
     if not path.is_file():
         raise ValueError(f"{path}: expected Inception weights of torch-fidelity, found no such file")
@@ -44,9 +43,10 @@ def inception_features(folder: Path | None) -> Features:
 
 
 def frechet_distance(found: Float[np.ndarray, "n d"], reference: Float[np.ndarray, "m d"]) -> float:
-    """FID (Heusel et al. 2017, Eq. 6): distance between the Gaussians with the sets' means and covariances.
+    """Compute FID (Heusel et al. 2017, Eq. 6): the Frechet distance between normal distributions fitted to both sets.
 
-    It is biased upwards with fewer images than features: compare only sets of equal size. nan for fewer than two.
+    FID is biased upwards if there are fewer images than features, so compare only sets of equal size. The result is nan
+    for fewer than two images.
     """
     if min(len(found), len(reference)) < 2:
         return math.nan
@@ -59,9 +59,10 @@ def frechet_distance(found: Float[np.ndarray, "n d"], reference: Float[np.ndarra
 
 
 def kernel_distance(found: Float[np.ndarray, "n d"], reference: Float[np.ndarray, "m d"], *, seed: int = 0) -> float:
-    """KID (Binkowski et al. 2018): unbiased squared maximum mean discrepancy with the kernel (x.y / d + 1)^3.
+    """Compute KID (Binkowski et al. 2018): the unbiased squared maximum mean discrepancy, kernel (x.y / d + 1)^3.
 
-    The mean over 100 random subsets of 50 images, or one set of all where there are fewer; nan for fewer than two.
+    The result is the mean over 100 random subsets of 50 images, or of one set if there are fewer. It is nan for fewer
+    than two images.
     """
     size = min(len(found), len(reference), _KID_SIZE)
     if size < 2:

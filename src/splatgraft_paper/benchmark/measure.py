@@ -1,4 +1,4 @@
-"""Metrics of a method on one scene: pictures of held-out views against the ground truth, and their consistency."""
+"""Metrics of a method on one scene: its pictures of held-out views against the truth, and their consistency."""
 
 import json
 import math
@@ -27,28 +27,28 @@ from splatgraft_paper.tables.layout import match_views, pictures
 
 @dataclass(frozen=True)
 class MeasureMethod:
-    """Compare one method with the truth on the held-out views of one scene."""
+    """Comparison of one method with the truth on the held-out views of one scene."""
 
     truth: Path
     """Capture with the object, with masks."""
     photographs: Path
     """Capture without the object, from the same cameras."""
     target: Path
-    """The reconstruction without the object, a .ply: the reference of the method's shadow."""
+    """Reconstruction without the object, a .ply; the method's shadow is measured against its renders."""
     out: Path
     """Folder for metrics.json and pictures/."""
     result: Path | None = None
     """The method's scene, a .ply."""
     pictures: Path | None = None
-    """Or its pictures, named as the views, or numbered as 3DGS's render.py does: all views, or the held-out ones."""
+    """Or its pictures, named as the views, or numbered as by 3DGS's render.py: all views or the held-out ones."""
     weights: Path | None = None
-    """Folder of LPIPS's weights."""
+    """Folder with LPIPS's weights."""
     lpips: bool = False
     """Whether LPIPS is measured."""
     device: Device = "auto"
 
     def inputs(self) -> Inputs:
-        """The truth, the result and the pictures."""
+        """List the truth, the result and the pictures."""
         files = {}
         for role, folder in (("truth", self.truth), ("photographs", self.photographs)):
             files[role] = read_capture(folder).image_paths
@@ -83,7 +83,7 @@ class MeasureMethod:
     def _images(
         self, scene: Gaussians | None, truth: PosedImages, chosen: list[int]
     ) -> Mapping[int, Float[Tensor, "h w 3"]]:
-        """Pictures by view: of a scene all, for consistency; of a folder those that exist, at least the held out."""
+        """Return pictures by view: renders of all views of a scene, or a folder's pictures with all held-out views."""
         if scene is not None:
             return {index: _picture(scene, truth, index) for index in range(len(truth))}
         assert self.pictures is not None
@@ -104,7 +104,7 @@ class MeasureMethod:
 
 
 def true_view(truth: PosedImages, photographs: PosedImages, index: int) -> Truth:
-    """The true picture of a view, its picture without the object, and the object's mask."""
+    """Return the true picture of a view, its picture without the object, and the object's mask."""
     mask = truth.mask(index)
     if mask is None:
         raise ValueError(f"{truth.image_paths[index]}: expected a mask of the object in masks/, found none")
@@ -134,7 +134,7 @@ def _picture(scene: Gaussians, truth: PosedImages, index: int) -> Float[Tensor, 
 def _consistency(
     folder: Path, truth: PosedImages, images: Mapping[int, Float[Tensor, "h w 3"]]
 ) -> dict[str, float | None]:
-    """Disagreement of neighbouring views of the method and of the ground truth; None where depth is unknown."""
+    """Compute the disagreement of neighbouring views of the method and of the truth; None if depth is unknown."""
     paths = [folder / "depth" / f"{Path(name).stem}.npy" for name in truth.cameras.names]
     if not all(path.is_file() for path in paths):
         return {"disagreement": None, "disagreement_truth": None}
@@ -148,10 +148,7 @@ def _consistency(
 
 
 REGIONS = ("whole", "object", "shadow", "rest")
-"""Regions of every metric; `shadow` is the band that the true object darkens by more than 5%."""
-_SAME_SURFACE = 0.02
-"""Relative difference of depth below which two views see the same point; allows for 16-bit depth and slanted surfaces.
-Set by hand."""
+"""Regions of every metric; `shadow` has the pixels that the true object darkens by more than 5%."""
 
 
 def measure_view(
@@ -161,10 +158,10 @@ def measure_view(
     background: Float[Tensor, "h w 3"],
     perceptual: Perceptual | None = None,
 ) -> dict[str, float]:
-    """PSNR, SSIM, FLIP and, with `perceptual`, LPIPS of every region, and the error of the shadow's strength.
+    """Compute PSNR, SSIM, FLIP and, with `perceptual`, LPIPS of every region, and the error of the shadow's strength.
 
     Images are sRGB in [0, 1]; `background` is the method's render without the object. LPIPS of a region compares the
-    truth with a copy that has the region's pixels of `image`. Values are nan where a region is too small.
+    truth with a copy that has the region's pixels of `image`. Values are nan for a region that is too small.
     """
     regions = find_regions(truth)
     plain = compare(image, truth, regions=regions, background=background)
@@ -182,7 +179,7 @@ def measure_view(
 def only_region(
     image: Float[Tensor, "h w 3"], truth: Truth, regions: Regions, name: str
 ) -> Float[Tensor, "h w 3"] | None:
-    """The truth with one region's pixels replaced by those of `image`; None where the region is too small."""
+    """Replace one region of the truth by the pixels of `image`; None if the region is too small."""
     if name == "whole":
         return image
     region: Bool[Tensor, "h w"] = getattr(regions, name)
@@ -196,7 +193,7 @@ def warp(
     cameras: Cameras,
     into_depth: Float[Tensor, "h w"],
 ) -> tuple[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]]:
-    """The second camera's image in the first camera's view, and the pixels where both cameras see the same point.
+    """Warp the second camera's image into the first camera's view, and mask the pixels that both cameras see.
 
     Depths are along the optical axis, 0 where nothing is hit.
     """
@@ -215,9 +212,10 @@ def warp(
     grid = (pixels / size * 2 - 1)[None]
     stacked = torch.cat([image, depth[..., None]], -1).permute(2, 0, 1)[None]
     warped = torch.nn.functional.grid_sample(stacked[:, :3], grid, align_corners=False)[0].permute(1, 2, 0)
-    # nearest, so that depths on both sides of an edge are not averaged
+    # nearest, because a mean of the depths on both sides of an edge would lie on neither surface
     found = torch.nn.functional.grid_sample(stacked[:, 3:], grid, mode="nearest", align_corners=False)[0, 0]
-    same = valid & inside & ((found - z).abs() < _SAME_SURFACE * z)
+    # 2% set by hand: 16-bit depth and slanted surfaces differ by less
+    same = valid & inside & ((found - z).abs() < 0.02 * z)
     return warped, same
 
 
@@ -227,10 +225,10 @@ def disagreement(
     masks: Sequence[Float[Tensor, "h w"]],
     cameras: Cameras,
 ) -> float | None:
-    """RMSE in sRGB between consecutive views, near the object, after warping by the true depth.
+    """Compute the RMSE in sRGB between consecutive views near the object, after warping by the true depth.
 
-    Pixels within an eighth of the image's width of the object's masks are compared. None where no consecutive views
-    have images. True gloss differs between views too, so compare with the value of the ground truth.
+    Pixels within an eighth of the image's width of the object's masks are compared. The result is None if no two
+    consecutive views have images. True gloss differs between views too, so compare with the value of the ground truth.
     """
     squares, count = 0.0, 0
     for i in sorted(images):

@@ -1,4 +1,4 @@
-"""Methods of the benchmark: a light transfer, a harmoniser and a consolidation, or pictures of another program."""
+"""Methods of the benchmark: light transfer, harmoniser and consolidation, or pictures of another program."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,45 +25,45 @@ Prior = Literal["off", "gain", "transplat", "transfer", "true-light"]
 Loss = Literal["fourier", "l1-dssim", "lpips", "paper", "paper-l1-dssim"]
 Schedule = Literal["once", "linear", "geometric"]
 UPDATES = 5
-"""Harmonisations of a schedule (paper: Iterative Dataset Update)."""
+"""Number of harmonisations of a schedule (paper, Iterative Dataset Update)."""
 _NAMES = {"copy-paste": "off", "reinhard": "off+reinhard", "flux": "off+flux"}
 _GRAMMAR = "PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], NAME=FOLDER, or " + ", ".join(_NAMES)
 
 
 @dataclass(frozen=True)
 class Harmonize(harmonize.Harmonize):
-    """The step with the methods of other projects too, which the command line does not offer."""
+    """The step, extended by the methods of other projects, which the command line does not offer."""
 
     method: HarmonizerOptions = field(default_factory=NoneOptions)  # pyright: ignore[reportIncompatibleVariableOverride]
-    """Any method's options."""
+    """Options of the method."""
 
 
 @dataclass(frozen=True)
 class Consolidate(consolidate.Consolidate):
-    """The step with updates by the methods of other projects too."""
+    """The step, extended by updates with the methods of other projects."""
 
     harmonizer: HarmonizerOptions = field(default_factory=NoneOptions)
-    """The method of the views, which updates use again."""
+    """Method that harmonised the views; updates use it again."""
 
     def harmonizer_options(self) -> HarmonizerOptions:
-        """The method of the views."""
+        """Return the method that harmonised the views."""
         return self.harmonizer
 
 
 @dataclass(frozen=True)
 class Method:
-    """One method, as the command line names it."""
+    """One method, parsed from its name on the command line."""
 
     name: str
     prior: Prior = "off"
-    """The light transfer in 3D: none, exposure alone, TranSplat's, the physical one, or that with the true light."""
+    """Light transfer in 3D: none, exposure alone, TranSplat's, the physical one, or that with the true light."""
     harmonizer: str | None = None
-    """The image model; without one, the prior is the result."""
+    """Image model; without one, the prior is the result."""
     loss: Loss = "fourier"
-    """Loss of the consolidation; `paper` is the paper's: 10,000 steps of Adam on LPIPS alone, `paper-l1-dssim` the same
-    steps on the loss of 3DGS (paper, Perceptual vs Photometric Loss)."""
+    """Loss of the consolidation. `paper` is 10,000 steps of Adam on LPIPS alone; `paper-l1-dssim` replaces LPIPS by the
+    loss of 3DGS (paper, Perceptual vs Photometric Loss)."""
     schedule: Schedule = "once"
-    """Whether views are harmonised again from the consolidated scene (paper, Iterative Dataset Update)."""
+    """Schedule by which views are harmonised again from the consolidated scene (paper, Iterative Dataset Update)."""
     pictures: Path | None = None
     """Folder of another program's results: SCENE/VIEW.png, named as the views of the ground truth, or numbered."""
 
@@ -90,7 +90,7 @@ class Method:
 
     @property
     def folder_name(self) -> str:
-        """The name without the characters that a folder's name cannot hold."""
+        """Name without the characters that a folder's name cannot contain."""
         return self.name.replace("/", "-")
 
 
@@ -108,26 +108,26 @@ class RelightForBenchmark:
     placement: Path
     """The composite's placement file."""
     cameras: Path
-    """The target's."""
+    """Cameras of the target."""
     surroundings: Path
-    """The source without the object."""
+    """Source scene without the object, a .ply."""
     object_cameras: Path
-    """The source's."""
+    """Cameras of the source."""
     out: Path
     """Folder for scene.ply."""
     prior: Literal["gain", "transplat", "true-light"]
     """The transfer."""
     light: Path | None = None
-    """light.json of the true light."""
+    """File light.json with the true light."""
 
     def inputs(self) -> Inputs:
-        """All files that are read."""
+        """List all files that are read."""
         rest = (self.cameras, self.object_cameras, *((self.light,) if self.light else ()))
         scenes = (self.target, self.surroundings)
         return {"scenes": scenes, "placement": placement_files(self.placement), "rest": rest}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make the relit composite."""
+        """Write the relit composite."""
         source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
         composite = read_composite(self.target, self.placement)
         if self.prior == "gain":
@@ -147,14 +147,13 @@ class RelightForBenchmark:
 
 @dataclass(frozen=True)
 class MethodSettings:
-    """What all methods of a run share."""
+    """Settings that all methods of a run share."""
 
     weights: Path | None = None
-    """Folder of LPIPS's weights."""
+    """Folder with LPIPS's weights."""
     model: str | None = None
     """Weights of the harmoniser: folder, file or hub id."""
     device: Device = "auto"
-    """Where to compute."""
     iterations: int = 10_000
     """Steps of the paper's consolidation."""
 
@@ -165,7 +164,7 @@ def run_method(
     settings: MethodSettings,
     console: Console,
 ) -> tuple[Path, dict[str, float]]:
-    """Run the stale steps of a method; gives its scene, a .ply, and the seconds of each of its own steps."""
+    """Run the stale steps of a method, and return its scene, a .ply, and the seconds of each of its own steps."""
     seconds: dict[str, float] = {}
     prior = scene.composite / SCENE_FILE
     if method.prior != "off":
@@ -176,7 +175,7 @@ def run_method(
     result = scene.work / "methods" / method.folder_name / "result"
     views = scene.work / "views" / method.prior
     composite = scene.composite / SCENE_FILE
-    # a prior without a transfer has no light, and a failed transfer found none
+    # without a transfer, or after a failed one, there is no light
     light = path if (path := prior.parent / LIGHT_FILE).is_file() else None
     render = Render(
         composite, scene.cameras, views, is_object=scene.is_object, prior=prior, light=light, device=settings.device

@@ -1,4 +1,4 @@
-"""One run of the benchmark: all methods measured on its scenes; tables as JSON, Markdown and a page."""
+"""One run of the benchmark: measures all methods on all scenes and writes tables as JSON, Markdown and a page."""
 
 import json
 import os
@@ -34,9 +34,6 @@ from splatgraft_paper.benchmark.methods import Method, MethodSettings, run_metho
 from splatgraft_paper.benchmark.scene import GroundTruthScene, compose_scene, perform_if_stale
 from splatgraft_paper.benchmark.table import Benchmark, Row, as_json, markdown, table_section, tables
 
-NOT_RUN_FILE = "not_run.txt"
-SECONDS_FILE = "seconds.json"
-
 
 @dataclass(frozen=True)
 class BenchmarkRun:
@@ -47,7 +44,7 @@ class BenchmarkRun:
     scenes: tuple[GroundTruthScene, ...]
     methods: tuple[Method, ...]
     options: ReconstructOptions
-    """Options of the reconstruction of every capture; its device serves all steps."""
+    """Options of every reconstruction; their device serves all steps."""
     weights: Path | None = None
     """Folder with the weights of LPIPS and Inception."""
     harmonizer_weights: str | None = None
@@ -55,7 +52,7 @@ class BenchmarkRun:
 
     @property
     def device(self) -> Device:
-        """Where to compute."""
+        """Device of all steps."""
         return cast(Device, self.options.device)
 
     def work(self, scene: GroundTruthScene) -> Path:
@@ -66,44 +63,38 @@ class BenchmarkRun:
         """Folder with the metrics and pictures of one method on one scene."""
         return self.work(scene) / "measured" / method.folder_name
 
-    def not_run_file(self, scene: GroundTruthScene, method: Method) -> Path:
-        """The file with the reason why a method could not run on a scene; absent where it ran."""
+    def outcome_file(self, scene: GroundTruthScene, method: Method) -> Path:
+        """File with the seconds of a method's steps on a scene, or the reason why it could not run."""
         out = self.measured(scene, method)
-        return out.with_name(f"{out.name}.{NOT_RUN_FILE}")
-
-    def seconds_file(self, scene: GroundTruthScene, method: Method) -> Path:
-        """The file with the seconds of each step of a method on a scene."""
-        out = self.measured(scene, method)
-        return out.with_name(f"{out.name}.{SECONDS_FILE}")
+        return out.with_name(f"{out.name}.json")
 
 
 def measure_scene(run: BenchmarkRun, scene: GroundTruthScene, lpips: bool) -> None:
-    """Run and measure all methods on one scene; a method that cannot run leaves a file with the reason."""
+    """Run and measure all methods on one scene; write the reason for a method that cannot run."""
     console = Console()
     console.say(f"scene {scene.name}")
-    apply_output = compose_scene(scene, run.work(scene), run.options, device=run.device, console=console)
+    composed = compose_scene(scene, run.work(scene), run.options, device=run.device, console=console)
     for method in run.methods:
-        out, reason = run.measured(scene, method), run.not_run_file(scene, method)
-        reason.unlink(missing_ok=True)
+        out, outcome = run.measured(scene, method), {}
         try:
             result, seconds = None, {}
             if method.pictures is None:
                 settings = MethodSettings(run.weights, run.harmonizer_weights, run.device)
-                result, seconds = run_method(method, apply_output, settings, console)
+                result, seconds = run_method(method, composed, settings, console)
             shown = None if method.pictures is None else method.pictures / scene.name
             step = MeasureMethod(
-                scene.truth, scene.target, apply_output.target, out, result, shown, run.weights, lpips, run.device
+                scene.truth, scene.target, composed.target, out, result, shown, run.weights, lpips, run.device
             )
             perform_if_stale(step, console)
-            times = {**({} if method.pictures else apply_output.seconds), **seconds}
-            run.seconds_file(scene, method).write_text(json.dumps(times))
+            outcome["seconds"] = {**({} if method.pictures else composed.seconds), **seconds}
         except ValueError as error:
-            reason.parent.mkdir(parents=True, exist_ok=True)
-            reason.write_text(str(error))
+            outcome["reason"] = str(error)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        run.outcome_file(scene, method).write_text(json.dumps(outcome))
 
 
 def unmeasurable_metrics(folder: Path | None) -> dict[str, str]:
-    """The metrics whose weights are missing, with the reason."""
+    """List the metrics whose weights are missing, with the reason."""
     missing = {}
     try:
         lpips_vgg(folder)
@@ -123,13 +114,14 @@ def collect_results(run: BenchmarkRun, missing: dict[str, str], failures: list[s
     for method in run.methods:
         for scene in run.scenes:
             out = run.measured(scene, method)
-            reason = run.not_run_file(scene, method)
-            if reason.is_file():
-                not_run.append(f"{method.name} on {scene.name} not run: {reason.read_text()}")
-            elif (out / METRICS_FILE).is_file():
+            file = run.outcome_file(scene, method)
+            if not file.is_file():
+                continue
+            if "reason" in (outcome := json.loads(file.read_text())):
+                not_run.append(f"{method.name} on {scene.name} not run: {outcome['reason']}")
+            else:
                 record = json.loads((out / METRICS_FILE).read_text())
-                times = json.loads(run.seconds_file(scene, method).read_text())
-                rows.append(Row(scene.name, method.name, record["values"], times))
+                rows.append(Row(scene.name, method.name, record["values"], outcome["seconds"]))
                 counts.add(len(record["views"]))
                 if (disagreement := record["values"].get("disagreement_truth")) is not None:
                     floors.append(disagreement)
@@ -189,7 +181,7 @@ def _distributions(run: BenchmarkRun) -> dict[str, dict[str, float | None]]:
 
 
 def _pictures(run: BenchmarkRun, method: Method, region: str) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-    """A method's pictures of all held-out views, each with the truth, which replaces it outside the region."""
+    """Yield a method's pictures of all held-out views with the truth; outside the region both are the truth."""
     for scene in run.scenes:
         truth, photographs = read_capture(scene.truth), read_capture(scene.target)
         for index, name in enumerate(truth.cameras.names):
@@ -209,7 +201,7 @@ def _span(counts: set[int]) -> str:
 
 
 def _benchmark_html(benchmark: Benchmark, views: Sequence[ViewFiles]) -> str:
-    """Format the page; the files of `views` are relative to it."""
+    """Format the page; paths in `views` are relative to it."""
     notes = [*benchmark.notes, *benchmark.not_run]
     notes += [f"Not measured: {name}: {reason}" for name, reason in benchmark.not_measured.items()]
     items = "".join(f"<li>{escape(note)}</li>" for note in notes)

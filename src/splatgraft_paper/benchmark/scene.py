@@ -1,4 +1,4 @@
-"""One benchmark scene reconstructed, segmented and composed, which are the steps that all methods share."""
+"""One benchmark scene, reconstructed, segmented and composed: the steps that all methods share."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ from splatgraft.runtime.console import Console
 from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE
 
 HELD_OUT_EVERY = 8
-"""Every 8th view, from the first, is held out of reconstruction, harmonisation and consolidation."""
+"""Stride of the views, from the first, that are held out of reconstruction, harmonisation and consolidation."""
 
 
 @dataclass(frozen=True)
@@ -37,15 +37,15 @@ class GroundTruthScene:
     target: Path
     """Capture of the target without the object."""
     truth: Path
-    """Capture with the object, with masks, from the target's cameras; depth/NAME.npy where depth is known."""
+    """Capture with the object and masks, from the target's cameras; depth/NAME.npy if depth is known."""
     placement: Path
-    """placement.json with the object's true pose."""
+    """File placement.json with the object's true pose."""
     light: Path | None = None
-    """light.json with the true light, where it is known."""
+    """File with the true light; None if it is not known."""
 
     @staticmethod
     def from_folder(folder: Path) -> "GroundTruthScene":
-        """Find the files of a scene that `synth benchmark` rendered."""
+        """Find the files of a scene that `paper synth benchmark` rendered."""
         parts = {name: folder / name for name in ("source", "target", "ground_truth", PLACEMENT_FILE)}
         if missing := [str(path) for path in parts.values() if not path.exists()]:
             raise ValueError(f"{folder}: expected {', '.join(parts)}; found no {Path(missing[0]).name}")
@@ -60,34 +60,33 @@ class ComposedScene:
     """The composite of a benchmark scene, on which methods are run."""
 
     name: str
-    """The scene's name."""
     work: Path
     """Folder of all results."""
     light: Path | None = None
-    """light.json with the true light, where it is known."""
+    """File with the true light; None if it is not known."""
     from_capture: bool = True
-    """Whether the object's own capture is known; without it, the light that the object had is not."""
+    """Whether the object's own capture is known; without it, its old light is unknown, too."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Seconds of the steps that all methods share."""
 
     @property
     def cameras(self) -> Path:
-        """The target's cameras without the held-out ones."""
+        """Cameras of the target without the held-out ones."""
         return self.work / "target" / "capture" / CAMERAS_FILE
 
     @property
     def source_cameras(self) -> Path | None:
-        """The cameras of the object's capture."""
+        """Cameras of the object's capture."""
         return self.work / "source" / "capture" / CAMERAS_FILE if self.from_capture else None
 
     @property
     def target(self) -> Path:
-        """The reconstruction of the target."""
+        """Reconstruction of the target."""
         return self.work / "target" / "scene" / SCENE_FILE
 
     @property
     def surroundings(self) -> Path | None:
-        """The source without the object."""
+        """Source scene without the object."""
         return self.work / "object" / SURROUNDINGS_FILE if self.from_capture else None
 
     @property
@@ -97,12 +96,12 @@ class ComposedScene:
 
     @property
     def is_object(self) -> Path:
-        """is_object.npy: which Gaussians of the composite belong to the object."""
+        """File is_object.npy: whether each Gaussian of the composite belongs to the object."""
         return self.composite / IS_OBJECT_FILE
 
 
 def perform_if_stale(step: Step, console: Console) -> float:
-    """Perform a step where its result is stale; returns the seconds that the result took."""
+    """Perform a step if its result is stale, and return the seconds that the result took."""
     if why_stale(job_of(step)):
         perform(step, console)
     record = read_record(step.out)

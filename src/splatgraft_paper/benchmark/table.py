@@ -23,13 +23,11 @@ class Row:
     """One method on one scene."""
 
     scene: str
-    """The scene's name."""
     method: str
-    """The method's name."""
     values: Mapping[str, float | None]
-    """Metric to its mean over held-out views; None where it could not be measured."""
+    """Mean over held-out views by metric; None if it could not be measured."""
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """Step to wall-clock seconds."""
+    """Wall-clock seconds by step."""
 
 
 @dataclass(frozen=True)
@@ -37,24 +35,24 @@ class Benchmark:
     """All results of a benchmark."""
 
     rows: tuple[Row, ...]
-    """One per scene and completed method."""
+    """One row per scene and completed method."""
     not_run: tuple[str, ...]
     """One sentence per method that could not run."""
     not_measured: Mapping[str, str]
-    """Metrics ("lpips", "fid and kid") to the reason why their columns are empty."""
+    """Reasons for empty columns by metric ("lpips", "fid and kid")."""
     notes: tuple[str, ...]
     """Conditions of the measurement: machine, sizes, numbers of views, commit, command."""
     pooled: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
-    """Method to FID and KID over the held-out views of all its scenes."""
+    """FID and KID by method, over the held-out views of all its scenes."""
 
     @property
     def methods(self) -> list[str]:
-        """Names in the order in which they appear."""
+        """Names of methods in the order of their first row."""
         return list(dict.fromkeys(row.method for row in self.rows))
 
     @property
     def scenes(self) -> list[str]:
-        """Names in the order in which they appear."""
+        """Names of scenes in the order of their first row."""
         return list(dict.fromkeys(row.scene for row in self.rows))
 
 
@@ -63,23 +61,23 @@ class Summary:
     """A mean over scenes with its bootstrap interval."""
 
     mean: float
-    """Over scenes with equal weights."""
+    """Mean over scenes with equal weights."""
     low: float
-    """2.5th percentile."""
+    """Percentile 2.5."""
     high: float
-    """97.5th percentile."""
+    """Percentile 97.5."""
     scenes: int
-    """Scenes that have a value."""
+    """Number of scenes with a value."""
 
 
 def metric_names() -> tuple[str, ...]:
-    """Names of all metrics, in the order of the tables."""
+    """List all metrics in the order of the tables."""
     by_region = [f"{metric}_{region}" for region in REGIONS for metric in _METRICS]
     return (*by_region, "shadow_ratio_rmse", "disagreement", "rest_mean_change", "rest_max_change")
 
 
 def summarize(values: Sequence[float | None], *, seed: int = 0) -> Summary | None:
-    """Mean over scenes with a 95% percentile bootstrap interval (Efron 1979); None where no scene has a value.
+    """Compute the mean over scenes and its 95% percentile bootstrap interval (Efron 1979); None without any value.
 
     The interval is too narrow for few scenes; for one scene both ends are its value.
     """
@@ -92,7 +90,7 @@ def summarize(values: Sequence[float | None], *, seed: int = 0) -> Summary | Non
 
 
 def summaries(benchmark: Benchmark) -> dict[str, dict[str, Summary | None]]:
-    """Summarise each metric by method; FID and KID are over the images of all scenes and have no interval."""
+    """Summarise each metric by method; FID and KID pool the images of all scenes and have no interval."""
     out: dict[str, dict[str, Summary | None]] = {}
     for method in benchmark.methods:
         rows = [row for row in benchmark.rows if row.method == method]
@@ -126,7 +124,7 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
 
     def markdown(self) -> str:
-        """Format it with its title."""
+        """Format the table with its title."""
         lines = ["| " + " | ".join(cells) + " |" for cells in (self.head, *self.rows)]
         lines.insert(1, "|" + " --- |" * len(self.head))
         return f"### {self.title}\n\n" + "\n".join(lines)
@@ -177,7 +175,7 @@ def _region_table(means: dict[str, dict[str, Summary | None]], region: str, benc
 
 
 def _pose_tables(benchmark: Benchmark) -> list[Table]:
-    """Means by pose over scenes with the object at several rotations (paper, illumination consistency)."""
+    """Make the table of means by pose of the object, for scenes with rotations (paper, illumination consistency)."""
     poses: dict[str, list[str]] = {}
     for scene in benchmark.scenes:
         if match := re.fullmatch(r".+_(p\d)", scene):
@@ -226,7 +224,7 @@ def _cell(name: str, found: Summary | None, missing: bool = False) -> str:
 
 
 def table_section(table: Table) -> str:
-    """Format one table with its title."""
+    """Format one table with its title as HTML."""
     head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in table.head)
     rows = "".join(
         f'<tr><th scope="row">{escape(name)}</th>' + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"

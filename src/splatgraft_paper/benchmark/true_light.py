@@ -1,8 +1,10 @@
-"""The true light at a place of a synthetic scene: a rendered panorama and the suns that it leaves out.
+"""The true light at a place of a synthetic scene, from a rendered panorama and the suns that it leaves out.
 
-The panorama is not clipped, as a photograph is: the sun of an environment map, or a studio's lamp, is some hundred
-times as bright as the rest. Such peaks become sources first; what is left is divided as a photograph's panorama. Bright
-patches of that become sources, too, the rest ambient light of degree 2.
+The panorama is not clipped: the sun of an environment map, or a studio's lamp, is 100 to 1000 times the mean.
+
+1. Each peak, with the pixels near it, becomes a source, and the median of its surroundings replaces it.
+2. Bright patches of the rest, as a camera would clip them, become sources, too.
+3. The remainder is fitted by ambient light of degree 2.
 """
 
 import json
@@ -22,30 +24,27 @@ from splatgraft.relighting.light.panorama import Panorama, cube_directions
 
 TRUE_LIGHT_FILE = "true_light.json"
 
-# which patches of a panorama without peaks are sources; set by hand
-_CLIPPED = 0.97  # sRGB of the brightest channel of a patch
-_BRIGHTEST_MEAN = 0.85  # sRGB that the mean of the three channels exceeds, besides: saturated colours are no light
+# patches that are sources, set by hand
+_CLIPPED = 0.97  # sRGB; minimum of the brightest channel of a patch
+_BRIGHTEST_MEAN = 0.85  # sRGB; minimum mean of the three channels, since saturated colours are no light
 _SMALLEST = 2e-4  # steradians; a smaller patch is a highlight
 _LARGEST = 0.6  # steradians; a larger patch is sky and stays ambient
 _MAX_PATCHES = 4
-_JOINED_PX = 2.0  # pixels between patches that are joined
-_MAX_JOINED = 32  # patches that are joined at all, the largest ones
+_MAX_JOINED = 32  # number of the largest patches, which may be joined; others are dropped
 _WIDEST = math.radians(15)  # radians, half the extent; longer patches are cut in half
-_CUTS = 2  # cuts of a patch, one after another
 
 _FACE = 64  # pixels; width of a face of the cube map
-_PEAK_OVER_MEAN, _PEAK_AROUND = 50.0, 5.0
-"""Times the mean gray radiance: a pixel above the first makes a peak, and near it pixels above the second belong to it.
-Set by hand: suns and lamps of environment maps are 100 to 1000 times the mean; windows of rooms stay below."""
-_PEAK_NEAR_DEG = 15.0  # degrees from the brightest pixel to what belongs to its peak
+# factors on the mean gray radiance, set by hand: windows of rooms stay below the first
+_PEAK_OVER_MEAN, _PEAK_AROUND = 50.0, 5.0  # minimum of a peak's brightest pixel, and of the other pixels of the peak
+_PEAK_NEAR_DEG = 15.0  # degrees; distance of a peak's pixels from its brightest
 _MAX_PEAKS = 6
 
 
 def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Light:
-    """A light from an equirectangular panorama of linear radiance and the entries of suns.json.
+    """Fit a light to an equirectangular panorama of linear radiance and the entries of suns.json.
 
     Row 0 is up (+z), the middle column +x, to the right -y. A sun has a direction (unit, towards it), irradiance
-    (linear rgb) and angular_radius (radians).
+    (linear RGB) and angular_radius (radians).
     """
     panorama, peaks = _without_peaks(panorama)
     directions, solid_angles = cube_directions(_FACE)
@@ -72,7 +71,7 @@ def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Ligh
 
 
 def _without_peaks(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], list[LightSource]]:
-    """The panorama with its peaks replaced by the median of what is near them, and the peaks as sources."""
+    """Split a panorama into peaks, as sources, and the rest, in which the median of nearby pixels fills the peaks."""
     directions, solid_angles = panorama_pixels(panorama)
     mean = float((panorama.mean(-1) * solid_angles).sum()) / (4 * math.pi)
     rest, peaks = panorama.clone(), []
@@ -92,7 +91,7 @@ def _without_peaks(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w
 def _source(
     radiance: Float[Tensor, "k 3"], directions: Float[Tensor, "k 3"], solid_angles: Float[Tensor, "k"]
 ) -> LightSource:
-    """Pixels as one round source: as much irradiance, from their mean direction, of their effective solid angle."""
+    """Replace pixels by one disc-shaped source of their irradiance, mean direction and effective solid angle."""
     power = radiance * solid_angles[:, None]
     gray = power.mean(1)
     extent = float(gray.sum() ** 2 / (gray * radiance.mean(1)).sum())
@@ -105,7 +104,7 @@ def _source(
 
 
 def panorama_pixels(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """Unit directions and solid angles of the pixels of an equirectangular panorama, as `light_from_probe` takes it."""
+    """Compute unit directions and solid angles of an equirectangular panorama's pixels (see `light_from_probe`)."""
     h, w = panorama.shape[:2]
     down = (torch.arange(h) + 0.5) / h * math.pi
     turn = (2 * math.pi * (0.5 - (torch.arange(w) + 0.5) / w)).expand(h, w)
@@ -115,12 +114,12 @@ def panorama_pixels(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h 
 
 
 def sample_panorama(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """An equirectangular panorama at unit directions, interpolated linearly; differentiable in both."""
+    """Sample an equirectangular panorama at unit directions, bilinearly; differentiable in both."""
     x, y, z = directions.reshape(-1, 3).unbind(-1)
     across = -torch.atan2(y, x) / math.pi
-    # the arc sine of z, but its gradient is finite at the poles
+    # equals the arc sine of z, but has a finite gradient at the poles
     down = -torch.atan2(z, torch.hypot(x, y).clamp_min(1e-6)) / (math.pi / 2)
-    # one column repeated on both sides, so that the seam at -x is interpolated too
+    # one column is repeated on both sides, so that the seam at -x is interpolated too
     wide = torch.cat([panorama[:, -1:], panorama, panorama[:, :1]], 1).permute(2, 0, 1)[None]
     across = across * panorama.shape[1] / (panorama.shape[1] + 2)
     grid = torch.stack([across, down], -1)[None, None]
@@ -129,9 +128,9 @@ def sample_panorama(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, 
 
 
 def _bright_patches(panorama: Panorama) -> tuple[list[LightSource], Bool[Tensor, "6 s s"]]:
-    """Connected parts of a panorama as bright as a camera records, brightest first, and the pixels they cover.
+    """Find connected patches that a camera would clip, and return them as sources, brightest first, and their pixels.
 
-    Parts that an edge between faces separates are joined. Parts wider than 30 degrees are cut in half along their
+    Patches that an edge between faces separates are joined. Patches wider than 30 degrees are cut in half along their
     longest extent, twice at most (median cut, Debevec 2005).
     """
     srgb = srgb_from_linear(panorama.radiance)
@@ -153,9 +152,9 @@ def _bright_patches(panorama: Panorama) -> tuple[list[LightSource], Bool[Tensor,
 
 
 def _joined(groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama) -> list[Bool[Tensor, "6 s s"]]:
-    """The groups, of which those with pixels nearer than two pixels' angle are joined."""
+    """Join the groups that are at most two pixels apart."""
     # a face spans 2 units of tan(angle)
-    touching = 2 * _JOINED_PX / panorama.alpha.shape[1]
+    touching = 2 * 2.0 / panorama.alpha.shape[1]
     out: list[Bool[Tensor, "6 s s"]] = []
     for group in sorted(groups, key=lambda g: -int(g.sum()))[:_MAX_JOINED]:
         for i, other in enumerate(out):
@@ -169,7 +168,7 @@ def _joined(groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama) -> list[Boo
 
 
 def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], *, depth: int = 0) -> list[tuple[float, LightSource]]:
-    """The group as one source with its power, or as several where it is long."""
+    """Replace a group by one source of its power, or by several if it is long."""
     directions, angles = panorama.directions[group], panorama.solid_angles[group]
     radiance = panorama.radiance[group]
     weight = angles * radiance.mean(-1)
@@ -178,7 +177,7 @@ def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], *, depth: int = 0) ->
     spread = directions - center
     values, vectors = torch.linalg.eigh(spread.T @ (weight[:, None] * spread))
     # a uniform strip of half-width w has variance w^2 / 3
-    if depth < _CUTS and float(values[-1].clamp_min(0).sqrt()) * math.sqrt(3) > _WIDEST:
+    if depth < 2 and float(values[-1].clamp_min(0).sqrt()) * math.sqrt(3) > _WIDEST:
         side = spread @ vectors[:, -1] > 0
         halves = []
         for half in (side, ~side):
@@ -203,7 +202,7 @@ def _triple(values: list[float]) -> tuple[float, float, float]:
 
 
 def read_probe(panorama: Path, suns: Path) -> Light:
-    """Read the light that was measured at a place: a panorama without the suns (.npy), and a list of suns (.json)."""
+    """Read the light measured at a place: a panorama without the suns (.npy), and a list of suns (.json)."""
     try:
         radiance = torch.from_numpy(np.load(panorama, allow_pickle=False)).float()
         return light_from_probe(radiance, json.loads(suns.read_text()))

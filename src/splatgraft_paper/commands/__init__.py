@@ -7,8 +7,6 @@ _TABLE = (
     ("tables", "tables:EvaluatePaper", "write the paper's tables from the authors' data set"),
     ("synth pairs", "synth:SynthPairs", "render training pairs with Blender"),
     ("synth benchmark", "synth:SynthBenchmark", "render benchmark scenes with ground truth"),
-    ("synth check", "synth:SynthCheck", "find damaged or empty pictures among rendered pairs or scenes"),
-    ("synth sheet", "synth:SynthSheet", "one picture with all rendered scenes of a folder"),
     ("synth spheres", "synth:SynthSpheres", "make training pairs of balls in a second each, to learn training"),
     ("synth generated", "generated:GeneratedPairs", "make training pairs of pictures that FLUX paints"),
     ("synth orida", "generated:OridaPairs", "make training pairs of ORIDa's photographs"),

@@ -1,4 +1,4 @@
-"""The command `paper benchmark`: methods are measured on scenes with ground truth."""
+"""The command `paper benchmark`, which measures methods on scenes with ground truth."""
 
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,19 +31,19 @@ class EvaluateBenchmark:
     """PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], such as off+flux, transfer+compact/l1-dssim, transfer+compact@geometric;
     or NAME=FOLDER for pictures of another program, FOLDER/SCENE/VIEW.png."""
     only: tuple[str, ...] = ()
-    """Names of scenes; all where none is given."""
+    """Names of scenes; default: all."""
     weights: Path | None = None
-    """Folder with the weights of LPIPS and Inception; torch hub's cache where not given."""
+    """Folder with the weights of LPIPS and Inception; default: torch hub's cache."""
     harmonizer_weights: str | None = None
     """Weights of the image model that the methods name: folder, file or hub id, as `harmonize --weights` takes them."""
     at_once: int = 1
-    """Scenes at a time on this machine."""
+    """Number of scenes at a time on this machine."""
     ray: str | None = None
-    """Address of a Ray cluster whose machines all see both folders; `local` for one of this machine's cores."""
+    """Address of a Ray cluster whose machines all see both folders; `local`: one of this machine's cores."""
     options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(quality="draft", device="auto"))
 
     def execute(self, console: Console) -> int:
-        """Run what is missing and write the report; 1 where a scene or a method failed."""
+        """Run what is missing and write the report; return 1 if a scene or a method failed."""
         methods = tuple(Method.parse(text) for text in self.methods)
         run = BenchmarkRun(self.out, self._scenes(), methods, self.options, self.weights, self.harmonizer_weights)
         missing = unmeasurable_metrics(self.weights)

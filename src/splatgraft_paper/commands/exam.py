@@ -1,4 +1,4 @@
-"""The command `paper exam`: the held-out benchmark of the light transfer, on new synthetic scenes of a number."""
+"""The command `paper exam`: the held-out benchmark of the light transfer, on synthetic scenes drawn from a number."""
 
 import hashlib
 import json
@@ -22,53 +22,41 @@ from splatgraft.runtime.process import source_commit
 from splatgraft_paper.exam.measure import ROWS, SceneResult, evaluate_scene
 from splatgraft_paper.exam.scenes import SIZE, TRAINING_NUMBER, draw_scenes, read_scene, render_scene
 from splatgraft_paper.exam.summary import summarize_light, summarize_row, summary_markdown
-from splatgraft_paper.synthesis.benchmark import SCENES
 from splatgraft_paper.synthesis.jobs import RenderWorkers
-
-_RENAMED_ROWS = {
-    "told-new": "true-new-light",
-    "told-both": "true-lights",
-    "told-both-and-normals": "true-lights-and-normals",
-}
-"""Names of version 0.1.0 that are understood for one more version."""
 
 
 @dataclass(frozen=True)
 class Exam:
-    """Measure the light transfer on scenes drawn from a number, or on given scenes; a stopped run goes on.
+    """Measure the light transfer on scenes drawn from a number, or on given scenes; a stopped run is continued.
 
-    The scenes follow from the number alone. A number is used once: whoever has looked at its scenes may tune to them.
+    The number alone determines the scenes. Use each number once: whoever has looked at its scenes may tune to them.
     """
 
     number: Annotated[int | None, tyro.conf.Positional] = None
-    """The scenes' seeds follow from it; 0 is for training, never a proof."""
-    benchmark: bool = False
-    """The nine benchmark scenes in the same size, instead of a number: a regression table."""
+    """Number that the scenes' seeds are drawn from; 0 is for training and proves nothing."""
     scenes_from: Path | None = None
     """Folder of rendered scenes, instead of a number."""
     scenes: int | None = None
-    """Number of scenes; 12, or all of --benchmark and --scenes-from."""
+    """Number of scenes; default: 12 of a number, all of --scenes-from."""
     out: Path | None = None
-    """Folder of scenes/, work/ (reconstructions), results/, pictures/ (held-out views one above the other: pasted,
-    transfer, with all that is true, truth), exam.md and exam.json; build/exam/NUMBER where not given."""
+    """Folder for scenes/, work/ (reconstructions), results/, pictures/, exam.md and exam.json; default:
+    build/exam/NUMBER. A picture has columns of held-out views: pasted, transfer, transfer with all truth, truth."""
     work: Path | None = None
-    """Folder of the reconstructions, to be shared by runs; OUT/work where not given."""
+    """Folder of the reconstructions, which runs may share; default: OUT/work."""
     iterations: int = 1000
     """Steps of each reconstruction."""
     budget: int = 20_000
     """Gaussians of each reconstruction."""
     rows: tuple[str, ...] = tuple(row for row in ROWS if row != "3dgs-dr")
-    """Rows of the table; 3dgs-dr, which fits two scenes more, only where it is named."""
+    """Rows of the table; 3dgs-dr is not in the default, because it fits two more scenes."""
     workers: RenderWorkers = field(default_factory=RenderWorkers)
 
     def execute(self, console: Console) -> int:
-        """Render, measure and report; 1 where a scene could not be made."""
-        given = [self.number is not None, self.benchmark, self.scenes_from is not None]
-        if sum(given) != 1:
-            raise ValueError(f"exam: expected a NUMBER, --benchmark or --scenes-from, found {sum(given)} of them")
-        rows = self._rows(console)
-        name = str(self.number) if given[0] else "benchmark" if given[1] else "given"
-        out = self.out or Path("build") / "exam" / name
+        """Render, measure and report; return 1 if a scene could not be made."""
+        if (self.number is None) == (self.scenes_from is None):
+            raise ValueError("exam: expected either a NUMBER or --scenes-from, found both or neither")
+        rows = self._rows()
+        out = self.out or Path("build") / "exam" / ("given" if self.number is None else str(self.number))
         results, failures = [], []
         for scene, make_folder in self._scene_folders(out, console):
             try:
@@ -80,34 +68,29 @@ class Exam:
         console.result(out / "exam.md")
         return 1 if failures else 0
 
-    def _rows(self, console: Console) -> tuple[str, ...]:
-        asked = []
-        for row in self.rows:
-            if row in _RENAMED_ROWS:
-                console.say(f"--rows: {row} is now {_RENAMED_ROWS[row]}; the next version drops the old name")
-            asked.append(_RENAMED_ROWS.get(row, row))
-        if unknown := [row for row in asked if row not in ROWS]:
+    def _rows(self) -> tuple[str, ...]:
+        if unknown := [row for row in self.rows if row not in ROWS]:
             raise ValueError(f"--rows: expected names among {', '.join(ROWS)}; found {unknown[0]}")
-        return tuple(row for row in ROWS if row in asked)
+        return tuple(row for row in ROWS if row in self.rows)
 
     @property
     def _options(self) -> ReconstructOptions:
         return ReconstructOptions(iterations=self.iterations, budget=self.budget)
 
     def _scene_folders(self, out: Path, console: Console) -> Iterator[tuple[str, partial[Path]]]:
-        """Name of each scene, and the function that renders what is missing of it and gives its folder."""
+        """Yield the name of each scene, and a function that renders what is missing of it and returns its folder."""
         if self.scenes_from is not None:
             folders = sorted(path.parent for path in self.scenes_from.glob("*/placement.json"))
             for folder in folders[: self.scenes]:
                 yield folder.name, partial(Path, folder)
             return
         python = self.workers.python(console)
-        scenes = SCENES[: self.scenes] if self.number is None else draw_scenes(self.number, self.scenes or 12)
-        for which in scenes:
+        assert self.number is not None
+        for which in draw_scenes(self.number, self.scenes or 12):
             yield which.name, partial(render_scene, which, out, python, jobs=self.workers.processes)
 
     def _result(self, folder: Path, out: Path, rows: tuple[str, ...], console: Console) -> SceneResult:
-        """The result of one rendered scene, measured where that is not done yet, or the code or an option changed."""
+        """Return the result of one rendered scene; measure it again if the code or an option has changed."""
         text = hashlib.sha256(f"{folder.resolve()} {rows} {self._options}".encode())
         for package in (splatgraft, splatgraft_paper.exam):
             for path in sorted(Path(package.__file__ or "").parent.rglob("*.py")):
@@ -157,10 +140,8 @@ class Exam:
         (out / "exam.md").write_text(text)
 
     def _title(self) -> str:
-        if self.scenes_from is not None:
-            return "Scenes that were given: no proof"
         if self.number is None:
-            return "The benchmark's nine scenes: no proof"
+            return "Scenes that were given: no proof"
         if self.number == TRAINING_NUMBER:
             return f"Number {self.number}, for training: no proof"
         return f"Held-out benchmark {self.number}"

@@ -1,4 +1,7 @@
-"""The commands `paper synth generated` and `paper synth orida`: pairs of relit pictures (paper, Sec. 5.2 and 5.3)."""
+"""The commands `paper synth generated` and `paper synth orida`, which make pairs of relit pictures.
+
+Source: paper, Sec. 5.2 and 5.3.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -33,12 +36,12 @@ class GeneratedPairs:
     out: Positional
     """Folder for one folder per sample, manifest.jsonl and sheet.png with all samples."""
     removal: Path
-    """The folder model/ that `splatgraft paper train removal` wrote."""
+    """Folder model/ that `splatgraft paper train removal` wrote."""
     relighting: RelightingOptions = field(default_factory=RelightingOptions)
     base: str = "flux"
     """Folder or hub id of FLUX with its text encoders; needs pip install 'splatgraft[text]'."""
     masks: str | None = None
-    """BiRefNet's .onnx file or hub id; the published one where not given."""
+    """BiRefNet's .onnx file or hub id; default: the published one."""
     number: int = 1600
     """Number of samples."""
     size: str = "704x496"
@@ -46,7 +49,6 @@ class GeneratedPairs:
     seed: int = 0
     """Seed of the prompts, the pictures and the lights."""
     device: Device = "auto"
-    """Where to compute."""
 
     def execute(self, console: Console) -> int:
         """Make the missing samples."""
@@ -87,7 +89,7 @@ class OridaPairs:
     out: Positional
     """Folder for one folder per photograph, manifest.jsonl and sheet.png with all samples."""
     orida: Path
-    """A folder with index.csv: a table with the columns image, mask, background (files), object and scene."""
+    """Folder with index.csv: a table with the columns image, mask, background (files), object and scene."""
     relighting: RelightingOptions = field(default_factory=RelightingOptions)
     number: int = 2000
     """Number of photographs."""

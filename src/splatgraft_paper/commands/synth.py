@@ -1,4 +1,4 @@
-"""The commands `paper synth ...` of rendered data: pairs, benchmark scenes, spheres, their checks and sheets."""
+"""The commands `paper synth ...` that render data: pairs, benchmark scenes and spheres."""
 
 import os
 from dataclasses import dataclass, field
@@ -6,9 +6,6 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import torch
-
-from splatgraft.core.images import read_rgb, resize, write_image
 from splatgraft.project.step import Positional, locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task
@@ -31,7 +28,7 @@ class SynthPairs:
     """Render training pairs for a harmoniser; a killed run is continued."""
 
     out: Positional
-    """Folder for one folder per scene, manifest.jsonl and, where something failed, failures.txt."""
+    """Folder for one folder per scene, manifest.jsonl and, after failures, failures.txt."""
     scenes: int = 60
     """Number of scenes; each gives 5 cameras x objects x lights pairs."""
     first: int = 0
@@ -41,29 +38,26 @@ class SynthPairs:
     samples: int = 128
     """Light paths per pixel; with the denoiser 16 are enough for small sizes."""
     objects: int = 2
-    """Per scene; the background is rendered once for all."""
+    """Objects per scene; the background is rendered once for all."""
     lights: int = 3
     """Environment maps per object."""
     paper: bool = False
-    """As many as the paper: 190 scenes with 2 objects and 27 lights, 1,900 targets and 51,300 composites."""
+    """Render the paper's number: 190 scenes with 2 objects and 27 lights, 1,900 targets and 51,300 composites."""
     seed: int = 0
     """Seed of all random choices."""
     maps: Path | None = None
-    """Folder with .hdr and .exr environment maps; those that come with Blender where not given."""
-    models: Path | None = None
-    """Folder with .glb, .gltf, .obj and .blend models that alternate with generated objects."""
+    """Folder with .hdr and .exr environment maps; default: the maps that come with Blender."""
     workers: RenderWorkers = field(default_factory=RenderWorkers)
 
     def execute(self, console: Console) -> int:
-        """Render what is missing, check everything; 1 where a scene failed or a pair is faulty."""
+        """Render what is missing and check everything; return 1 if a scene failed or a pair is faulty."""
         scenes = pairs.PAPER_SCENES if self.paper else self.scenes
         plan = pairs.PairPlan(
             objects=2 if self.paper else self.objects,
             lights=pairs.PAPER_LIGHTS if self.paper else self.lights,
             seed=self.seed,
             size=read_render_size(self.size, self.samples),
-            maps=_files(self.maps, (".hdr", ".exr"), "--maps") or SUPPLIED_MAPS,
-            models=_files(self.models, (".glb", ".gltf", ".obj", ".blend"), "--models"),
+            maps=SUPPLIED_MAPS if self.maps is None else _maps(self.maps),
         )
         hours, cores = scenes * plan.cpu_seconds / 3600, os.cpu_count() or 1
         console.say(
@@ -86,12 +80,10 @@ class SynthPairs:
             return pairs.check_pairs(self.out, failures, console)
 
 
-def _files(folder: Path | None, suffixes: tuple[str, ...], option: str) -> tuple[str, ...]:
-    if folder is None:
-        return ()
-    found = sorted(str(path.resolve()) for path in folder.rglob("*") if path.suffix.lower() in suffixes)
+def _maps(folder: Path) -> tuple[str, ...]:
+    found = sorted(str(path.resolve()) for path in folder.rglob("*") if path.suffix.lower() in (".hdr", ".exr"))
     if not found:
-        raise ValueError(f"{option} {folder}: expected files that end in {', '.join(suffixes)}, found none")
+        raise ValueError(f"--maps {folder}: expected files that end in .hdr or .exr, found none")
     return tuple(found)
 
 
@@ -104,19 +96,19 @@ class SynthBenchmark:
     size: Literal["small", "paper"] = "small"
     """small: 352x248, 40 views, 16 samples. paper: 704x496, 200 views, 128 samples."""
     scenes: tuple[str, ...] = ()
-    """Names of scenes; all nine where none is given."""
+    """Names of scenes; default: all nine."""
     rotations: bool = False
-    """Also the three scenes with the object at three rotations (name_p0, name_p1, name_p2)."""
+    """Add three scenes with the object at three rotations (NAME_p0, NAME_p1, NAME_p2)."""
     views: int | None = None
-    """Another number of views per capture."""
+    """Views per capture; default: that of --size."""
     pixels: str | None = None
-    """Another size of pictures, WIDTHxHEIGHT."""
+    """Pixels of a picture, WIDTHxHEIGHT; default: that of --size."""
     samples: int | None = None
-    """Another number of light paths per pixel."""
+    """Light paths per pixel; default: that of --size."""
     workers: RenderWorkers = field(default_factory=RenderWorkers)
 
     def execute(self, console: Console) -> int:
-        """Render what is missing, write the scenes as captures and check them; 1 where one failed."""
+        """Render what is missing, write the scenes as captures and check them; return 1 if one failed."""
         size = self._size()
         planned = {which: list(zip(benchmark.plan(which, size), self._folders(which), strict=True))
                    for which in self._chosen()}  # fmt: skip
@@ -159,54 +151,6 @@ class SynthBenchmark:
 
 
 @dataclass(frozen=True)
-class SynthCheck:
-    """Check every picture of a folder of pairs or benchmark scenes, and list the damaged and empty ones."""
-
-    out: Positional
-    """The folder that `paper synth pairs` or `paper synth benchmark` wrote."""
-
-    def execute(self, console: Console) -> int:
-        """Rewrite the manifest of pairs; 1 where something is faulty."""
-        scenes = sorted(path.parent for path in self.out.glob("*/scene.json"))
-        if not scenes:
-            return pairs.check_pairs(self.out, [], console)
-        faults = [wrong for wrong in map(benchmark.find_defect, scenes) if wrong]
-        console.say(f"{len(scenes) - len(faults)} of {len(scenes)} scenes are sound")
-        write_failures(self.out, faults, console)
-        return 1 if faults else 0
-
-
-@dataclass(frozen=True)
-class SynthSheet:
-    """Write one picture with all scenes of a folder."""
-
-    out: Positional
-    """The folder that `paper synth pairs` or `paper synth benchmark` wrote."""
-    picture: Path | None = None
-    """Where to write it; sheet.png in the folder where not given."""
-    columns: int = 6
-    """Pictures side by side."""
-    width: int = 240
-    """Pixels of one picture."""
-
-    def execute(self, console: Console) -> int:
-        """Write the sheet."""
-        paths = sorted(self.out.glob("*/object*/0002.png")) or sorted(self.out.glob("*/ground_truth/images/0002.png"))
-        paths = [path for path in paths if "_light" not in path.parent.name]
-        if not paths:
-            raise ValueError(f"{self.out}: expected rendered pairs or benchmark scenes, found none")
-        pictures = [read_rgb(path) for path in paths]
-        height = round(self.width * pictures[0].shape[0] / pictures[0].shape[1])
-        small = [resize(picture, self.width, height) for picture in pictures]
-        small += [torch.ones(height, self.width, 3)] * (-len(small) % self.columns)
-        rows = [torch.cat(small[i : i + self.columns], 1) for i in range(0, len(small), self.columns)]
-        target = self.picture or self.out / "sheet.png"
-        write_image(target, torch.cat(rows, 0))
-        console.result(target)
-        return 0
-
-
-@dataclass(frozen=True)
 class SynthSpheres:
     """Render pairs of two balls on a floor without Blender, a fifth of a second each; a killed run is continued."""
 
@@ -215,7 +159,7 @@ class SynthSpheres:
     scenes: int = 400
     """Number of scenes."""
     lights: int = 3
-    """Other suns per scene."""
+    """Number of other suns per scene."""
     size: str = "64x48"
     """Pixels, WIDTHxHEIGHT."""
     seed: int = 0

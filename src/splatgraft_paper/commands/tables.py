@@ -1,4 +1,4 @@
-"""The command `paper tables`: the paper's tables on the authors' data set, published numbers beside measured."""
+"""The command `paper tables`: the paper's tables on the authors' data set, with published and measured numbers."""
 
 import os
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from splatgraft_paper.benchmark.image_features import INCEPTION_FILE
 from splatgraft_paper.benchmark.methods import Method, MethodSettings
 from splatgraft_paper.benchmark.run import unmeasurable_metrics
 from splatgraft_paper.tables.data_ablation import DataAblation, measure_models
-from splatgraft_paper.tables.layout import PaperScene, download, find_scenes
+from splatgraft_paper.tables.layout import PaperScene, find_scenes
 from splatgraft_paper.tables.our_pictures import OurRun
 from splatgraft_paper.tables.paper_numbers import published_name
 from splatgraft_paper.tables.report import write_paper_report
@@ -24,7 +24,7 @@ from splatgraft_paper.tables.run import PaperRun, perform_paper_run
 from splatgraft_paper.training.pairs import DataOptions
 
 PAPERS_OWN = "off+flux/paper"
-"""Our implementation of the paper's method: copy-paste, FLUX, 10,000 steps of Adam on LPIPS."""
+"""Name of our implementation of the paper's method: copy-paste, FLUX, 10,000 steps of Adam on LPIPS."""
 
 
 @dataclass(frozen=True)
@@ -32,44 +32,40 @@ class EvaluatePaper:
     """Measure the authors' published pictures, run ours on their scenes, and write the paper's tables."""
 
     data: Path
-    """Folder of the published data set (the one that holds data_3d/ or dot3d_data/)."""
+    """Folder of the published data set, which contains data_3d/ or dot3d_data/."""
     out: Path = Path("paper")
     """Folder for index.html, paper.md, paper.json, figures/ and all results."""
     measure_only: bool = False
-    """Measure the pictures that are there, and run nothing: needs no GPU and no weights."""
+    """Measure existing pictures and run no method; needs no GPU and no weights."""
     methods: tuple[str, ...] = (
         "copy-paste", "transfer", PAPERS_OWN,
         f"{PAPERS_OWN}-l1-dssim", f"{PAPERS_OWN}@linear", f"{PAPERS_OWN}@geometric",
     )  # fmt: skip
-    """Methods of ours to run, as `paper benchmark` names them; off+flux/paper is the paper's own."""
+    """Our methods to run, by the names of `paper benchmark`; off+flux/paper is the paper's own."""
     only: tuple[str, ...] = ()
-    """Names of scenes; all where none is given."""
+    """Names of scenes; default: all."""
     all_views: bool = False
     """Measure all views, not only the held-out ones."""
-    download: bool = False
-    """Fetch the data set into the folder first."""
     weights: Path | None = None
-    """Folder with the weights of LPIPS and Inception; torch hub's cache where not given."""
+    """Folder with the weights of LPIPS and Inception; default: torch hub's cache."""
     harmonizer_weights: str | None = None
     """Weights of the image model that the methods name: folder, file or hub id, as `harmonize --weights` takes them."""
     models: tuple[str, ...] = ()
-    """NAME=FOLDER of harmonisers for Table 3, by the names of their recipes (paper, without-blender, ..) or others."""
+    """NAME=FOLDER of harmonisers for Table 3; NAME is the recipe (paper, without-blender, ..) or another name."""
     pairs: tuple[str, ...] = ()
-    """Folders of rendered pairs for Table 3, as `paper train flux` takes them, which holds the test split out."""
+    """Folders of rendered pairs for Table 3, those of `paper train flux`, which holds the test split out."""
     generated: tuple[str, ...] = ()
-    """Folders of generated pairs, likewise."""
+    """Folders of generated pairs for Table 3."""
     orida: tuple[str, ...] = ()
-    """Folders of ORIDa's pairs, likewise."""
+    """Folders of ORIDa's pairs for Table 3."""
     pairs_size: str = "704x496"
-    """Pixels of a pair, WIDTHxHEIGHT, as the models were trained."""
+    """Pixels of a pair, WIDTHxHEIGHT, the size at which the models were trained."""
     iterations_of_consolidation: int = 10_000
     """Steps of the paper's consolidation."""
     options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(quality="draft", device="auto"))
 
     def execute(self, console: Console) -> int:
-        """Measure and run what is missing and write the tables; 1 where a method that was asked for could not run."""
-        if self.download:
-            download(self.data)
+        """Measure and run what is missing and write the tables; return 1 if one of --methods could not run."""
         scenes = self._chosen(find_scenes(self.data))
         missing_metrics = unmeasurable_metrics(self.weights)
         for name, reason in missing_metrics.items():
@@ -99,7 +95,7 @@ class EvaluatePaper:
         return 1 if failed else 0
 
     def _by_model(self, missing: Mapping[str, str], console: Console) -> dict[str, dict[str, float]]:
-        """Table 3, where models are given."""
+        """Measure the models of Table 3; empty without --models."""
         if not self.models:
             return {}
         named = {name: Path(folder) for name, found, folder in (text.partition("=") for text in self.models) if found}
@@ -127,7 +123,7 @@ class EvaluatePaper:
 
 
 def _stand_ins(weights: Path | None, missing: Mapping[str, str]) -> frozenset[str]:
-    """Metrics that are measured with other weights than the published ones."""
+    """List the metrics whose weights differ from the published ones."""
     folder = weights or Path(torch.hub.get_dir()) / "checkpoints"
     files = {
         "lpips": ("lpips", VGG_FILE),

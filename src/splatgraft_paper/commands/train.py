@@ -1,8 +1,8 @@
-"""The commands `paper train ...`: the paper's harmoniser, its object removal, and the compact harmoniser."""
+"""The commands `paper train ...`, for the paper's harmoniser, its object removal, and the compact harmoniser."""
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -33,7 +33,7 @@ class TrainFlux:
 
     @staticmethod
     def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
-        """Put the options of --recipe before the user's own words."""
+        """Put the options of --recipe before the user's own arguments."""
         return arguments_with_recipe("train flux", words)
 
     def execute(self, console: Console) -> int:
@@ -54,7 +54,7 @@ class TrainRemoval:
 
     @staticmethod
     def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
-        """Put the options of --recipe before the user's own words."""
+        """Put the options of --recipe before the user's own arguments."""
         return arguments_with_recipe("train removal", words)
 
     def execute(self, console: Console) -> int:
@@ -75,45 +75,32 @@ class TrainCompact:
     """Folder that `splatgraft paper synth pairs` rendered."""
     loop: CompactOptions = field(default_factory=CompactOptions)
     held_out: HeldOutOptions = field(default_factory=HeldOutOptions)
-    variants: int = 1
-    """Perturbed lights per pair; each adds 0.25 MB per pair at 240x160."""
-    start: Path | None = None
-    """Initial weights, a compact.safetensors, to continue the training with other pairs."""
     device: Device = "auto"
-    """Where to compute."""
 
     def execute(self, console: Console) -> int:
         """Write the missing priors, train, write the weights."""
-        from splatgraft.harmonization.compact.network import SHIPPED, read_weights, write_weights
+        from splatgraft.harmonization.compact.network import SHIPPED, write_weights
 
         device = choose_device(self.device, console)
         samples = read_manifest(self.pairs)
         folders = sorted({sample.folder for sample in samples})
         self.out.mkdir(parents=True, exist_ok=True)
-        begin = None if self.start is None else read_weights(self.start)
-        loop = self.loop if begin is None else replace(self.loop, network=begin.size)
-        priors = [self.out / "priors" / str(variant) for variant in range(self.variants)]
-        for variant, folder in enumerate(priors):
-            with console.bar(f"light {variant + 1}") as progress:
-                write_priors(folders, folder, seed=loop.seed + variant, progress=progress)
+        with console.bar("priors") as progress:
+            write_priors(folders, self.out / "priors", seed=self.loop.seed, progress=progress)
         with console.bar("read") as progress:
-            pairs = CompactPairs(self.pairs, priors, self.held_out, progress)
+            pairs = CompactPairs(self.pairs, self.out / "priors", self.held_out, progress)
         console.say(f"{len(pairs.training)} pairs to train on, {len(pairs.validation)} held out")
         with console.bar("train") as progress:
-            task = CompactTask(pairs, loop, device, None if begin is None else begin.state_dict())
-            options = loop.loop(cpu=device.type == "cpu")
-            state = train(task, options, self.out, say=console.say, progress=progress)
+            options = self.loop.loop(cpu=device.type == "cpu")
+            state = train(CompactTask(pairs, self.loop, device), options, self.out, say=console.say, progress=progress)
         notes = {
             "pairs": json.dumps({"folders": [folder.name for folder in folders], **pairs.fingerprint()}),
-            "steps": str(loop.steps),
-            "seed": str(loop.seed),
+            "steps": str(self.loop.steps),
+            "seed": str(self.loop.seed),
         }
-        write_weights(self.out / SHIPPED.name, loop.network, state, notes)
+        write_weights(self.out / SHIPPED.name, self.loop.network, state, notes)
         console.say(f"{self.out / SHIPPED.name}")
         return 0
-
-
-_CLIP_TOKENS = 77
 
 
 @dataclass(frozen=True)
@@ -121,13 +108,13 @@ class TrainEmbed:
     """Compute the empty prompt's embeddings of FLUX (T5 and CLIP) or Stable Diffusion (CLIP)."""
 
     out: Annotated[Path | None, tyro.conf.Positional] = None
-    """File to write; where `harmonize` and `train` look, unless given."""
+    """File to write; default: the place where `harmonize` and `train` look for it."""
     base: str | None = None
-    """Folder or hub id with the text encoders and tokenizers; the default base of --kind where not given."""
+    """Folder or hub id with the text encoders and tokenizers; default: the base model of --kind."""
     tokens: int = 256
     """Length of FLUX's text sequence; schnell was distilled at 256."""
     kind: Literal["flux", "stable-diffusion"] = "flux"
-    """The model whose text encoders are used; needs transformers (pip install 'splatgraft[text]')."""
+    """Model whose text encoders are used; needs transformers (pip install 'splatgraft[text]')."""
 
     def execute(self, console: Console) -> int:
         """Write the file."""
@@ -138,7 +125,7 @@ class TrainEmbed:
         out = self.out or prompt_file(base)
         out.parent.mkdir(parents=True, exist_ok=True)
         console.say(f"{base}: CLIP embeds the empty prompt")
-        clip = _embed(base, "CLIPTokenizer", "CLIPTextModel", _CLIP_TOKENS)
+        clip = _embed(base, "CLIPTokenizer", "CLIPTextModel", 77)  # the length of CLIP's text sequence
         if self.kind == "flux":
             console.say(f"{base}: T5 embeds the empty prompt")
             tokens = _embed(base, "T5TokenizerFast", "T5EncoderModel", self.tokens, number="_2").last_hidden_state[0]
@@ -151,12 +138,13 @@ class TrainEmbed:
 
 @torch.no_grad()
 def _embed(base: str, tokenizer: str, encoder: str, length: int, *, number: str = "") -> Any:
-    """The output of a text encoder of `base` for the empty prompt, padded to `length` tokens."""
-    # by name: its types, of which none is used, take a third of the time of the whole check of types
+    """Compute a text encoder's output for the empty prompt, padded to `length` tokens."""
+    # imported by name, because pyright would spend a third of its time on types that are not used
     transformers: Any = import_module("transformers")
 
     def load(kind: str, part: str) -> Any:
-        if Path(base).is_dir() and not (Path(base) / part).is_dir():  # of which transformers makes an empty tokenizer
+        # transformers would make an empty tokenizer from a missing folder
+        if Path(base).is_dir() and not (Path(base) / part).is_dir():
             raise ValueError(f"{base}: expected {kind} in {part}/, found no such folder")
         try:
             return getattr(transformers, kind).from_pretrained(base, subfolder=part)

@@ -1,1 +1,1 @@
-"""The held-out benchmark of the light transfer (`paper exam`)."""
+"""The held-out benchmark of the light transfer, `paper exam`."""

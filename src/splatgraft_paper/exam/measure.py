@@ -1,7 +1,7 @@
-"""The rows of the held-out benchmark of the light transfer, measured on the held-out views of a scene.
+"""Rows of the held-out benchmark of the light transfer, measured on the held-out views of a scene.
 
-Pasting, the transfer with everything estimated, with more and more of the ground truth given, and what new colours of
-the Gaussians can reach at all; errors of the light, as irradiance without occlusion, and of normals.
+Rows are other methods, the transfer with estimates replaced by the truth one after another, and colours fitted to the
+truth. Errors of the estimated light (its irradiance without occlusion) and of normals are measured, too.
 """
 
 import math
@@ -30,7 +30,7 @@ ROWS: Mapping[str, str] = {
     "paste": "the object as it was captured",
     "gain": "one gain per channel, from the light around both places",
     "transplat": "the ratio of irradiances at each normal (TranSplat's diffuse path), both estimated; no shadow",
-    "3dgs-dr": "3DGS-DR: the object reflects an environment that is fitted to the target's photographs; no shadow",
+    "3dgs-dr": "3DGS-DR: the object reflects an environment that is fitted to the target's photos; no shadow",
     "transfer": "the transfer, everything estimated",
     "true-new-light": "the transfer with the ground-truth new light",
     "true-lights": "the transfer with both ground-truth lights",
@@ -40,7 +40,7 @@ ROWS: Mapping[str, str] = {
 
 
 def make_row(row: str, scene: ExamScene) -> tuple[Gaussians | ReflectiveScene, Relit | None]:
-    """The scene that a row gives, and the transfer in layers where the row is one."""
+    """Make the scene of a row; return the transfer in layers, too, if the row has one."""
     if row == "paste":
         return scene.composite.bake()[0], None
     if row == "gain":
@@ -57,23 +57,23 @@ def make_row(row: str, scene: ExamScene) -> tuple[Gaussians | ReflectiveScene, R
 
 
 def _with_reflections(scene: ExamScene) -> ReflectiveScene:
-    """The object's reflections and the target's environment, each fitted to the photographs of its own capture."""
+    """Fit the object's reflections and the target's environment, each to its own capture, and insert the object."""
     composite, placed = scene.composite, scene.composite.objects[0]
     source = fit_reflections(concatenate([scene.source.gaussians, placed.gaussians]), scene.photos["source"])
     is_object = torch.arange(source.gaussians.count) >= scene.source.gaussians.count
     taken = source.select(is_object)
     moved = replace(placed, gaussians=taken.gaussians).in_target()
     target = fit_reflections(composite.target.select(~composite.erased), scene.photos["target"])
-    # as in a composite: what the object stands on does not cover its foot
+    # as in a composite, so that the support does not cover the object's foot
     target = replace(target, gaussians=flatten_contact_layers(target.gaussians, [moved]))
     return insert(target, [replace(taken, gaussians=moved)])
 
 
 def _fitted_to_truth(scene: ExamScene) -> Gaussians:
-    """The scene of `true-lights` with colours that make the true object and the true shadow in the views of `cameras`.
+    """Fit colours of the scene of `true-lights` to the true object and the true shadow in the views of `cameras`.
 
-    The shadow is the ratio of the true pictures with and without the object, on the target as it was reconstructed, so
-    that errors of the reconstruction count as little as in the other rows.
+    The true shadow is the ratio of the true pictures with and without the object, times a render of the target. Errors
+    of the reconstruction then count no more than in the other rows.
     """
     source, light = _with_truth("true-lights", scene)
     lit = relight(scene.composite, scene.cameras, sources=[source], light=light).bake()[0]
@@ -103,45 +103,45 @@ def _with_truth(row: str, scene: ExamScene) -> tuple[SourceScene, Light | None]:
 
 
 LIGHT_ROW = "transfer"
-"""The row whose estimates of light and normals are measured."""
+"""Row whose estimates of light and normals are measured."""
 METRICS = {"object": "psnr_object", "whole": "psnr_whole", "shadow": "shadow_ratio_rmse"}
-"""Values of a row, and their names in `measure_view`: PSNR in dB twice, and the error of the shadow's strength."""
+"""Names in `measure_view` of a row's values: PSNR in dB of object and whole image, error of the shadow's strength."""
 _PICTURED = ("paste", "transfer", "true-lights-and-normals")
-_OPAQUE = 0.3  # opacity above which the normal of a Gaussian is measured
+_OPAQUE = 0.3  # minimum opacity of a Gaussian whose normal is measured
 
 
 @dataclass(frozen=True)
 class SceneResult:
-    """What was measured on one scene; a value is None where it is not defined."""
+    """Measurements on one scene; a value is None if it is not defined."""
 
     name: str
     rows: dict[str, dict[str, float | None]] = field(default_factory=dict)
-    """Per row the values of `METRICS`, means over held-out views."""
+    """Values of `METRICS` by row, means over held-out views."""
     light: dict[str, dict[str, float] | None] = field(default_factory=dict)
-    """`light_errors` at the new and the old place; None where no light was found."""
+    """Results of `light_errors` by place, `new` and `old`; None if no light was found."""
     normals_deg: float | None = None
-    """Median angle between estimated and true normals of the object."""
+    """Median angle between estimated and true normals of the object, degrees."""
     notes: tuple[str, ...] = ()
-    """Why a row or a value is missing; what the transfer reports."""
+    """Reasons for missing rows or values, and the transfer's own notes."""
 
     @property
     def ratio_level(self) -> float | None:
-        """Error of the level of the ratio of new to old light, stops."""
+        """Error of the ratio of new to old light, in stops of its level."""
         new, old = self.light.get("new"), self.light.get("old")
         return None if new is None or old is None else new["level"] - old["level"]
 
     def as_json(self) -> dict:
-        """Plain data, from which `from_json` makes the same value."""
+        """Convert to plain JSON values."""
         return asdict(self)
 
     @staticmethod
     def from_json(record: dict) -> "SceneResult":
-        """Read what `as_json` gave."""
+        """Convert back from the values of `as_json`."""
         return SceneResult(**{**record, "notes": tuple(record["notes"])})
 
 
 def evaluate_scene(scene: ExamScene, rows: Sequence[str], picture: Path) -> SceneResult:
-    """Make and measure the rows of a scene, and write a .png of its held-out views, one above the other."""
+    """Make and measure the rows of a scene, and write a .png with a column of held-out views for some rows."""
     values, columns, notes = {}, [], []
     light, normals_deg = {}, None
     for row in rows:
@@ -163,7 +163,7 @@ def evaluate_scene(scene: ExamScene, rows: Sequence[str], picture: Path) -> Scen
 
 
 def measure_row(result: Gaussians | ReflectiveScene, views: Sequence[TrueView]) -> dict[str, float | None]:
-    """The values of `METRICS`, means over the views where they are defined."""
+    """Compute the values of `METRICS`, means over the views in which they are defined."""
     found = [measure_view(view.picture(result), view.truth, background=view.background) for view in views]
     out: dict[str, float | None] = {}
     for short, name in METRICS.items():
@@ -173,7 +173,7 @@ def measure_row(result: Gaussians | ReflectiveScene, views: Sequence[TrueView]) 
 
 
 def _measure_estimates(scene: ExamScene, relit: Relit) -> tuple[dict[str, dict[str, float] | None], float | None]:
-    """Errors of both lights, and of the normals in degrees, of a transfer that estimates everything."""
+    """Measure both lights, and the normals in degrees, of a transfer that estimates everything."""
     light = {"new": None if relit.light is None else light_errors(relit.light, scene.new_light), "old": None}
     if not relit.prepared:
         return light, None
@@ -186,10 +186,6 @@ def _measure_estimates(scene: ExamScene, relit: Relit) -> tuple[dict[str, dict[s
     return light, median_angle_deg(found.normals.vectors, scene.normals @ rotation.T, opaque_and_seen)
 
 
-_NORMALS = 200  # even directions over which errors of irradiance are averaged
-_FINE_NORMALS = 10_000  # even directions among which the one of most irradiance is looked for; 2 degrees apart
-_DARKEST = 1e-6  # linear irradiance; less counts as this
-
 LIGHT_ERRORS = ("rms", "level", "tint", "direction_deg")
 
 
@@ -197,12 +193,12 @@ def light_errors(estimated: Light, truth: Light) -> dict[str, float]:
     """Measure an estimated light against the true one.
 
     Returns:
-        `rms`: of log2 of the ratio of gray irradiance over even normals, stops; `level`: its mean, positive where the
-        estimate is too bright; `tint`: RMS over normals and channels of log2 of the ratio of irradiance over that of
-        gray irradiance, stops; `direction_deg`: angle between the normals of most gray irradiance.
+        Errors over even normals, in stops of the ratio of estimated to true irradiance: `rms` and `level` are the RMS
+        and the mean of its gray value (a positive level is too bright), `tint` is the RMS of the channels relative to
+        gray. `direction_deg` is the angle between the normals with the highest gray irradiance, degrees.
     """
-    normals = even_directions(_NORMALS)
-    colors = [light.irradiance(normals).clamp_min(_DARKEST) for light in (estimated, truth)]
+    normals = even_directions(200)
+    colors = [light.irradiance(normals).clamp_min(1e-6) for light in (estimated, truth)]
     grays = [color.mean(1, keepdim=True) for color in colors]
     gray = (grays[0] / grays[1]).log2()
     tint = (colors[0] / colors[1]).log2() - gray
@@ -216,7 +212,7 @@ def light_errors(estimated: Light, truth: Light) -> dict[str, float]:
 
 
 def median_angle_deg(one: Float[Tensor, "n 3"], other: Float[Tensor, "n 3"], which: Bool[Tensor, "n"]) -> float | None:
-    """The median angle between unit normals, over those that `which` chooses; None where it chooses none."""
+    """Compute the median angle between unit normals, over those that `which` selects; None if it selects none."""
     if not bool(which.any()):
         return None
     return float((one * other).sum(1)[which].clamp(-1, 1).acos().rad2deg().median())
@@ -227,5 +223,5 @@ def _rms(values: Tensor) -> float:
 
 
 def _brightest(light: Light) -> Float[Tensor, "3"]:
-    normals = even_directions(_FINE_NORMALS)
+    normals = even_directions(10_000)  # 2 degrees apart
     return normals[light.irradiance(normals).mean(1).argmax()]

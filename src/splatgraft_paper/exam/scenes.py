@@ -1,4 +1,4 @@
-"""Scenes of the held-out benchmark: drawn from a number alone, rendered, reconstructed, and read with their truth."""
+"""Scenes of the held-out benchmark: drawn from a number, rendered, reconstructed, and read with their truth."""
 
 import random
 from collections.abc import Mapping
@@ -34,20 +34,20 @@ from splatgraft_paper.synthesis.benchmark import BenchmarkScene, BenchmarkSize, 
 from splatgraft_paper.synthesis.jobs import RenderSize, render_job
 from splatgraft_paper.synthesis.places import KINDS
 
-_CELLS = 80  # width of the image in whose cells surface points are compared; the object takes up half of it or less
-_BEHIND = 0.05  # share of the object's size by which a point may lie behind the nearest one and still count as seen
+_CELLS = 80  # width and height of a coarse depth image of surface points; the object takes up half of it or less
+_BEHIND = 0.05  # share of the object's size; points farther behind the nearest one of a cell are hidden
 TRAINING_NUMBER = 0
-"""Its scenes are for development; every other number is used for one exam only."""
+"""Number whose scenes are for development; every other number is used for one exam only."""
 SIZE = BenchmarkSize(RenderSize(width=288, height=204, samples=8), views=18)
+# range of the seeds of scenes and objects. Other seeds are lower: benchmark scenes 9000001 and up, objects 11 and up;
+# development scenes 9100 to 9999; training pairs 100003 x set + scene, objects below 2**31
 _SEEDS = (2**31, 2**32)
-"""Range of the seeds of scenes and objects. The benchmark's scenes have 9000001 and up, its objects 11 and up, the
-development scenes 9100 to 9999; training pairs have 100003 x set + scene, and objects below 2**31."""
 
 
 def draw_scenes(number: int, count: int) -> tuple[BenchmarkScene, ...]:
-    """Draw the scenes of an exam: all kinds in turn, in an order drawn too, each with a seed and an object's seed.
+    """Draw the scenes of an exam: all kinds in turn, in random order, each with a seed of the scene and of the object.
 
-    Seeds whose scene has no room for the cameras are drawn again. The first scenes do not depend on `count`.
+    A seed is drawn again if its scene has no room for the cameras. The first scenes do not depend on `count`.
     """
     rng = random.Random(f"exam-{number}")
     kinds = rng.sample(KINDS, len(KINDS))
@@ -63,9 +63,9 @@ def draw_scenes(number: int, count: int) -> tuple[BenchmarkScene, ...]:
 
 
 def render_scene(which: BenchmarkScene, out: Path, blender_python: Path, *, jobs: int) -> Path:
-    """Render what is missing of a scene into renders/ and scenes/ of `out`; gives its folder."""
+    """Render what is missing of a scene into renders/ and scenes/ of `out`, and return its folder."""
     folder = out / "scenes" / which.name
-    if not (folder / TRUE_LIGHT_FILE).is_file():  # it is written last
+    if not (folder / TRUE_LIGHT_FILE).is_file():  # this file is written last
         sides = [out / "renders" / f"{which.name}_{side}" for side in ("target", "source")]
         planned = zip(plan(which, SIZE), sides, strict=True)
         tasks = [Task(side.name, partial(render_job, job, side, blender_python)) for job, side in planned]
@@ -80,16 +80,16 @@ def render_scene(which: BenchmarkScene, out: Path, blender_python: Path, *, jobs
 
 @dataclass(frozen=True)
 class TrueView:
-    """One view of the target with what is true of it."""
+    """One view of the target with its ground truth."""
 
     camera: Cameras
     truth: Truth
     background: Float[Tensor, "h w 3"]
-    """The reconstructed target without the object, sRGB in [0, 1]."""
+    """Render of the reconstructed target without the object, sRGB in [0, 1]."""
 
     @torch.no_grad()
     def picture(self, scene: Gaussians | ReflectiveScene) -> Float[Tensor, "h w 3"]:
-        """A scene from this view, sRGB in [0, 1]."""
+        """Render a scene from this view, sRGB in [0, 1]."""
         if isinstance(scene, ReflectiveScene):
             return scene.picture(self.camera).clamp(0, 1)
         return render(scene, self.camera).color[0].clamp(0, 1)
@@ -97,30 +97,30 @@ class TrueView:
 
 @dataclass(frozen=True)
 class ExamScene:
-    """One scene with what is true of it; n Gaussians of the object."""
+    """One scene with its ground truth; the object has n Gaussians."""
 
     name: str
     composite: Composite
     cameras: Cameras
-    """The target's, without the held-out ones."""
+    """Cameras of the target, without the held-out ones."""
     source: SourceScene
-    """The source without the object, and without its true light."""
+    """Source without the object and without its true light."""
     views: tuple[TrueView, ...]
-    """Held out: nothing was fitted to them."""
+    """Held-out views, to which nothing was fitted."""
     fitted_views: tuple[TrueView, ...]
-    """Those of `cameras`, whose pictures without the object the target was fitted to."""
+    """Views of `cameras`; the target was fitted to their pictures without the object."""
     new_light: Light
-    """True, at the object's place in the target, target's frame."""
+    """True light at the object's place in the target, target's frame."""
     old_light: Light
-    """True, at its place in the source, source's frame."""
+    """True light at the object's place in the source, source's frame."""
     normals: Float[Tensor, "n 3"] | None
-    """True, of the object's Gaussians, source's frame; None where the object's surface is not known."""
+    """True normals of the object's Gaussians, source's frame; None if the object's surface is not known."""
     photos: Mapping[str, PosedImages] = field(default_factory=dict)
-    """Those that the `source` and the `target` were reconstructed from."""
+    """Photos from which `source` and `target` were reconstructed."""
 
 
 def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: Console) -> ExamScene:
-    """Reconstruct and compose a rendered scene in `work` where that is not done yet, and read it."""
+    """Read a rendered scene, after reconstructing and composing it in `work` if that is not done yet."""
     files = GroundTruthScene.from_folder(folder)
     composed = compose_scene(files, work, options, device="cpu", console=console)
     composite = read_composite(composed.target, composed.composite / PLACEMENT_FILE)
@@ -160,10 +160,9 @@ def _read_normals(path: Path, thing: Gaussians, cameras: Cameras) -> Float[Tenso
 
 
 def seen_surface(surface: Float[Tensor, "m 6"], cameras: Cameras) -> Float[Tensor, "s 6"]:
-    """The surface points (position, unit normal) that some camera sees: not what lies inside of the object or under it.
+    """Select the surface points (position, unit normal) that a camera sees, without those inside or under the object.
 
-    A point is seen where it faces the camera and no point in its cell of an image, of ten or more, is nearer by more
-    than a share of the object's size.
+    A camera sees a point that faces it, unless a point in the same cell of a coarse depth image is much nearer.
     """
     points, normals = surface[:, :3], surface[:, 3:]
     middle, size = points.mean(0), float((points - points.mean(0)).norm(dim=1).max())
@@ -184,6 +183,6 @@ def seen_surface(surface: Float[Tensor, "m 6"], cameras: Cameras) -> Float[Tenso
 
 
 def nearest_normals(points: Float[Tensor, "n 3"], surface: Float[Tensor, "m 6"]) -> Float[Tensor, "n 3"]:
-    """The outward normal of the nearest of m surface points (position and unit normal) to each point."""
+    """Look up each point's outward normal at the nearest of m surface points (position and unit normal)."""
     nearest = KDTree(surface[:, :3].numpy()).query(points.numpy())[1]
     return surface[torch.from_numpy(nearest), 3:].contiguous()

@@ -1,4 +1,4 @@
-"""The figures of a held-out benchmark over all its scenes, and its report in Markdown."""
+"""Figures of a held-out benchmark over all its scenes, and its report in Markdown."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,33 +14,33 @@ _LIGHT_TITLES = {
     "rms": "irradiance, RMS over normals, stops",
     "level": "its level, stops",
     "tint": "its tint, stops",
-    "direction_deg": "direction of most irradiance, degrees",
+    "direction_deg": "direction of the highest irradiance, degrees",
 }
 
 
 @dataclass(frozen=True)
 class RowSummary:
-    """One row over all scenes on which it and pasting were measured; None where there is no such scene."""
+    """One row over all scenes on which it and pasting were measured; values are None without such a scene."""
 
     scenes: int
     object_gain: float | None
-    """Mean of the object's PSNR minus that of pasting, dB."""
+    """Mean gain of the object's PSNR over pasting, dB."""
     shadow_removed: float | None
-    """Mean share of pasting's shadow error that is gone."""
+    """Mean share of pasting's shadow error that is removed."""
     worse: int
-    """Scenes whose whole image has a lower PSNR than pasted."""
+    """Number of scenes whose whole image has a lower PSNR than pasting."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean and worst of the absolute values of an error."""
+    """Mean and maximum of the absolute values of an error."""
 
     mean: float
     worst: float
 
 
 def summarize_row(row: str, results: Sequence[SceneResult]) -> RowSummary:
-    """One row against pasting."""
+    """Compare one row with pasting."""
     objects, wholes, shadows = (_beside_paste(row, results, metric) for metric in ("object", "whole", "shadow"))
     return RowSummary(
         scenes=len(wholes),
@@ -51,7 +51,7 @@ def summarize_row(row: str, results: Sequence[SceneResult]) -> RowSummary:
 
 
 def summarize_light(results: Sequence[SceneResult]) -> dict[str, Spread | None]:
-    """Errors of the light over all places, new and old; of the ratio's level and of normals over all scenes."""
+    """Summarise errors of the light over all places, and errors of the ratio's level and of normals over all scenes."""
     places = [errors for r in results for errors in r.light.values() if errors is not None]
     out = {_LIGHT_TITLES[name]: _spread([errors[name] for errors in places]) for name in LIGHT_ERRORS}
     out["level of the ratio of new to old light, stops"] = _spread([r.ratio_level for r in results])
@@ -60,7 +60,7 @@ def summarize_light(results: Sequence[SceneResult]) -> dict[str, Spread | None]:
 
 
 def summary_markdown(results: Sequence[SceneResult]) -> str:
-    """Tables of a line per scene, then the summary."""
+    """Format tables with a line per scene, then the summary and the notes."""
     rows = [row for row in ROWS if any(row in r.rows for r in results)]
     parts = []
     for metric in METRICS:
@@ -99,7 +99,7 @@ def _text(value: float | None, name: str) -> str:
 
 
 def _beside_paste(row: str, results: Sequence[SceneResult], metric: str) -> list[tuple[float, float]]:
-    """A row's value and that of pasting, of the scenes that have both."""
+    """Pair the values of a row and of pasting, for the scenes that have both."""
     out = []
     for one in results:
         value, paste = (one.rows.get(name, {}).get(metric) for name in (row, "paste"))

@@ -1,6 +1,6 @@
-"""An image-editing service over HTTP with the paper's prompt (Sec. 7); used only on request, with a limit on its cost.
+"""Client of an image-editing service with the paper's prompt (Sec. 7), used only on request and up to a cost limit.
 
-The protocol is that of Google's `generateContent` (the paper's Nano Banana is gemini-2.5-flash-image).
+The protocol is Google's `generateContent`; the paper's Nano Banana is gemini-2.5-flash-image.
 """
 
 import base64
@@ -36,12 +36,12 @@ class ImageEditingOptions:
     name: ClassVar[str] = "image-editing"
 
     weights: str = _URL
-    """Address of the service; the paper's where not given."""
+    """Address of the service; default: the paper's."""
     max_cost: float = 0.0
-    """US dollars that may be spent at most."""
+    """Maximum cost, US dollars."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
-        """Say what it costs; the key stays in the environment, since options are recorded in step.json."""
+        """Print the cost and check the key, an environment variable because options are saved in step.json."""
         url = self.weights
         if not url.startswith(("https://", "http://127.0.0.1", "http://localhost")):
             raise ValueError(f"harmonizer image-editing: expected --weights https://..., found {url}")
@@ -56,7 +56,7 @@ class ImageEditingOptions:
 
 @dataclass(frozen=True)
 class ImageEditing:
-    """An image-editing service; one request per view."""
+    """An image-editing service that gets one request per view."""
 
     url: str
     key: str

@@ -1,4 +1,4 @@
-"""Methods that the benchmark compares with, by name; here LBM and the colour transfer of Reinhard et al."""
+"""Peer methods of the benchmark by name, among them LBM and the colour transfer of Reinhard et al."""
 
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -22,11 +22,8 @@ _LMS_FROM_RGB = torch.tensor([[0.3811, 0.5783, 0.0402], [0.1967, 0.7244, 0.0782]
 _LAB_FROM_LOG_LMS = torch.diag(torch.tensor([3.0, 6.0, 2.0]).rsqrt()) @ torch.tensor(
     [[1.0, 1, 1], [1, 1, -2], [1, -1, 0]]
 )
-_DARKEST = 3e-4
-"""Linear light to which smaller values are raised: 1/255 in sRGB; below, the logarithm amplifies quantisation."""
-_FLAT_DEVIATION = 1e-4  # deviation in l-alpha-beta below which a channel of the object is shifted but not scaled
-_RING_WIDTH, _MIN_RING_PX = 0.5, 3
-"""Width of the ring around the object, as a share of the root of the object's area, and at least in pixels."""
+_DARKEST = 3e-4  # minimum linear light, 1/255 in sRGB; below, the logarithm amplifies quantisation
+_FLAT_DEVIATION = 1e-4  # in l-alpha-beta; an object's channel with a smaller deviation is shifted but not scaled
 
 
 @dataclass(frozen=True)
@@ -36,15 +33,15 @@ class ReinhardOptions:
     name: ClassVar[str] = "reinhard"
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
-        """Make the harmoniser."""
+        """Return the harmoniser, which has no weights."""
         return Reinhard()
 
 
 class Reinhard:
-    """Matches mean and deviation per channel in l-alpha-beta to those in a ring around the object; adds no shadow."""
+    """Matching of mean and deviation per channel in l-alpha-beta to those in a ring around the object; no shadow."""
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """Shift the object's colours in the prior; unchanged where object or ring has fewer than two pixels."""
+        """Shift the object's colours in the prior; return it unchanged if object or ring has fewer than two pixels."""
         inside = view.mask > 0.5
         around = _ring(inside)
         if int(inside.sum()) < 2 or int(around.sum()) < 2:
@@ -58,8 +55,8 @@ class Reinhard:
 
 
 def _ring(inside: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Pixels around the object, outside of it."""
-    width = max(_MIN_RING_PX, round(float(inside.sum()) ** 0.5 * _RING_WIDTH))
+    """Mask the pixels around the object; the ring is half as wide as the root of the object's area."""
+    width = max(3, round(float(inside.sum()) ** 0.5 * 0.5))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * width + 1, 2 * width + 1))
     dilated = torch.from_numpy(cv2.dilate(inside.numpy().astype(np.uint8), kernel)) > 0
     return dilated & ~inside
@@ -77,7 +74,7 @@ def _srgb_from_lab(lab: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
 
 @dataclass(frozen=True)
 class LbmOptions:
-    """LBM relighting (Chadebec et al. 2025), run through your own installation of its package (licence CC BY-NC)."""
+    """LBM relighting (Chadebec et al. 2025), run in your own installation of its package (licence CC BY-NC)."""
 
     name: ClassVar[str] = "lbm"
 
@@ -99,14 +96,14 @@ class LbmOptions:
 
 @dataclass(frozen=True)
 class Lbm:
-    """Latent bridge matching in one step from the composite; untested with the real package and weights."""
+    """Latent bridge matching (LBM), one step from the composite; untested with the real package and weights."""
 
     model: Any
     evaluate: Any
-    """The function of that name in `lbm.inference`."""
+    """Function `lbm.inference.evaluate`."""
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """Relight the composite; pixels outside the object keep the composite's colours, as in the authors' code."""
+        """Relight the composite; as in the authors' code, pixels outside the object keep their colours."""
         given = Image.fromarray((view.composite * 255).round().to(torch.uint8).numpy())
         made = self.evaluate(self.model, given, 1).convert("RGB").resize(given.size, Image.Resampling.BICUBIC)
         image = torch.from_numpy(np.array(made)).float() / 255
@@ -114,11 +111,11 @@ class Lbm:
 
 
 PEERS = {kind.name: kind for kind in (ReinhardOptions, LbmOptions, MVCoLightOptions, ImageEditingOptions)}
-"""Name of a method to its options."""
+"""Options by name of the method."""
 
 
 def method_options(name: str, *, weights: str | None = None) -> HarmonizerOptions:
-    """The default options of a method of `HARMONIZERS` or `PEERS`, with other weights where it takes any."""
+    """Return the default options of a method of `HARMONIZERS` or `PEERS`; `weights` replaces its weights, if any."""
     known = {**HARMONIZERS, **PEERS}
     if name not in known:
         raise ValueError(f"harmonizer: expected one of {', '.join(sorted(known))}, found {name!r}")

@@ -1,7 +1,7 @@
 """MV-CoLight's single-view network (Ren et al. 2025), run in the user's own checkout and Python environment.
 
-A small program is run there and exchanges arrays through files. The input is prepared as in the authors' data set
-classes: the shorter side becomes 256 pixels and a square is cut out. They keep the one in the middle; here several
+A small program runs there and exchanges arrays through files. The input is prepared as in the authors' data set
+classes: the shorter side becomes 256 pixels and a square is cut out. The authors keep the middle square; here several
 squares cover the view and their changes are blended. Untested with the real code and weights.
 """
 
@@ -20,9 +20,9 @@ from splatgraft.harmonization.interface import Harmonized, Harmonizer, Harmonize
 from splatgraft.runtime.process import last_line, run_logged
 
 SIDE = 256
-"""Pixels: the size that the network was trained at."""
+"""Width and height of the network's pictures, pixels, as in its training."""
 RATIO_OFFSET = 0.02
-"""sRGB, added to both sides of the network's output over its input, against noise in the dark."""
+"""Offset on both sides of the ratio of the network's output and input, sRGB, against noise in dark pixels."""
 
 # runs in the other project's Python, in its folder, as `python - MODEL_FOLDER INPUT.npy OUTPUT.npy`
 _PROGRAM = """
@@ -53,9 +53,9 @@ class MVCoLightOptions:
     name: ClassVar[str] = "mv-colight"
 
     weights: str | None = None
-    """Folder with config.py and model_step_N.pt; must be given."""
+    """Folder with config.py and model_step_N.pt; required."""
     checkout: Path | None = None
-    """Folder of its code; must be given."""
+    """Folder of its code; required."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
         """Find the folders."""
@@ -76,15 +76,15 @@ class MVCoLightOptions:
 
 @dataclass(frozen=True)
 class MVCoLight:
-    """The network, in a new process for each view."""
+    """The network, run in a new process for each view."""
 
     checkout: Path
     weights: Path
     python: Path
-    """The interpreter that runs it."""
+    """Interpreter that runs the network."""
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """Apply the network's change, as a ratio at its own size, to the composite."""
+        """Multiply the composite by the ratio of the network's output and input, upsampled from the network's size."""
         height, width = view.mask.shape
         small = network_input(view)
         with tempfile.TemporaryDirectory() as name:
@@ -92,7 +92,7 @@ class MVCoLight:
             np.save(given, small.numpy())
             command = [str(self.python), "-", str(self.weights), str(given), str(out)]
             log = Path(name) / "log"
-            # standard output stays out of the log, whose last line is to be that of the error
+            # standard output is not logged, so that the last line of the log is the error's
             code = run_logged(command, log, folder=self.checkout, stdin=_PROGRAM, on_line=lambda _: None)
             if code != 0 or not out.is_file():
                 last = last_line(log) or "no output"
@@ -103,10 +103,10 @@ class MVCoLight:
 
 
 def network_input(view: HarmonizerInputs) -> Float[Tensor, "k 7 256 256"]:
-    """Squares of composite, background and depth divided by its maximum, the shorter side at the network's size."""
+    """Cut squares of composite, background and depth over its maximum; the shorter side becomes 256 pixels."""
     depth = view.depth / view.depth.max().clamp_min(1e-6)
     rows, columns = _reduced(*view.mask.shape)
-    # one by one: OpenCV shrinks at most four channels
+    # resized one by one, because OpenCV shrinks at most four channels
     parts = [resize(picture, columns, rows) for picture in (view.composite, view.background, depth[..., None])]
     small = torch.cat(parts, -1).permute(2, 0, 1)
     squares = [small[:, y : y + SIDE, x : x + SIDE] for y in _starts(rows) for x in _starts(columns)]
@@ -114,19 +114,19 @@ def network_input(view: HarmonizerInputs) -> Float[Tensor, "k 7 256 256"]:
 
 
 def _reduced(height: int, width: int) -> tuple[int, int]:
-    """Rows and columns of the view whose shorter side is `SIDE`."""
+    """Compute rows and columns of the view when its shorter side is `SIDE`."""
     scale = SIDE / min(height, width)
     return round(height * scale), round(width * scale)
 
 
 def _starts(length: int) -> list[int]:
-    """First pixels of evenly spaced squares that cover a side, neighbours overlapping where there are several."""
+    """List the first pixels of evenly spaced, overlapping squares that cover a side."""
     count = 1 if length == SIDE else length // SIDE + 1
     return [round(i * (length - SIDE) / max(count - 1, 1)) for i in range(count)]
 
 
 def _joined(squares: Float[Tensor, "k 3 256 256"], height: int, width: int) -> Float[Tensor, "i j 3"]:
-    """The squares laid over each other, each with the weight of a tent."""
+    """Blend the squares with tent weights."""
     rows, columns = _reduced(height, width)
     tent = torch.minimum(torch.arange(SIDE) + 1, SIDE - torch.arange(SIDE)).float()
     weight = torch.minimum(tent[:, None], tent[None, :])

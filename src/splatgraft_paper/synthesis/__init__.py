@@ -1,1 +1,1 @@
-"""Synthetic scenes with ground truth, rendered by Blender: training pairs and the benchmark."""
+"""Synthetic scenes with ground truth, rendered with Blender: training pairs and the benchmark."""

@@ -1,9 +1,14 @@
 """Nine benchmark scenes with ground truth (paper, Sec. 7): six indoor, three outdoor.
 
-Each scene is rendered by two jobs and then laid out as captures in `<out>/<scene>/`: `source/` (the object on a
-pedestal in another light), `target/` (the scene without it), `ground_truth/` (the scene with it, from the target's
-cameras), all with transforms.json; `placement.json`; `probe.npy` and `suns.json`, the true light at the object's place.
-Source and target have the object at the same coordinates, rotated about the vertical by the pose's angle, so that the
+Two jobs render each scene, which is then written as captures, all with transforms.json, in `<out>/<scene>/`:
+
+    source/                  the object on a pedestal in another light
+    target/                  the scene without the object
+    ground_truth/            the scene with the object, from the target's cameras
+    placement.json           pose of the object in the target
+    probe.npy, suns.json     the true light at the object's place
+
+The object has the same coordinates in source and target, rotated about the vertical by the pose's angle, so the
 placement is known exactly.
 """
 
@@ -31,23 +36,21 @@ from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Ta
 from splatgraft_paper.synthesis.places import SUPPLIED_MAPS, make_scene
 from splatgraft_paper.synthesis.scene import Material, Part, Place, Scene, World, add, capture_cameras
 
-_OBJECT_POINTS = 40_000  # sampled points on the object, from which its true normals follow
-_SURFACE_RADIUS = 8.0  # metres around the object's middle within which its surface is sampled: all of it
 POSES_DEG = (0.0, 120.0, 240.0)
-"""P0, P1, P2: the object's rotations in the illumination-consistency scenes (paper, Table 2)."""
+"""Rotations P0, P1 and P2 of the object in the illumination-consistency scenes, degrees (paper, Table 2)."""
 
 
 @dataclass(frozen=True)
 class BenchmarkScene:
-    """The seeds of one benchmark scene."""
+    """Seeds of one benchmark scene."""
 
     name: str
     kind: str
     seed: int
-    """Seed of the scene; differs from all seeds of training pairs."""
+    """Seed of the scene; no training pair has it."""
     object_seed: int
     pose_deg: float = 0.0
-    """The object's rotation about the vertical between source and target."""
+    """Rotation of the object about the vertical between source and target, degrees."""
 
 
 SCENES: tuple[BenchmarkScene, ...] = (
@@ -70,7 +73,7 @@ ROTATIONS: tuple[BenchmarkScene, ...] = tuple(
 
 @dataclass(frozen=True)
 class BenchmarkSize:
-    """Size and number of the benchmark's views."""
+    """Size and number of a capture's views."""
 
     render: RenderSize
     views: int
@@ -80,7 +83,7 @@ SIZES = {"small": BenchmarkSize(RenderSize(352, 248, 16), 40), "paper": Benchmar
 
 
 def pedestal_scene(seed: int, place: Place) -> Scene:
-    """Make the scene where the object is captured: a pedestal among furniture under an environment map."""
+    """Make the scene in which the object is captured: a pedestal among furniture under an environment map."""
     rng = random.Random(f"stage-{seed}")
     palette = Palette(rng)
     x, y, z = place.location
@@ -108,7 +111,7 @@ def pedestal_scene(seed: int, place: Place) -> Scene:
 
 
 def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
-    """Plan the job in the target scene (target, truth, light) and that on the pedestal (source, light, surface)."""
+    """Plan the jobs in the target scene (target, truth, light) and on the pedestal (source, light, surface)."""
     scene = make_scene(which.kind, which.seed)
     place = scene.places[0]
     parts = objects.make(which.object_seed, place)
@@ -135,7 +138,7 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
         with_object("ground_truth"),
         Take("light", scene=True, probe=middle),
     )  # fmt: skip
-    surface = SurfaceSampling(_OBJECT_POINTS, middle, _SURFACE_RADIUS)
+    surface = SurfaceSampling(40_000, middle)  # for the true normals
     source = job(
         pedestal_scene(which.object_seed, place), yaw, which.object_seed,
         with_object("source"),
@@ -160,10 +163,17 @@ def rendered_cameras(out: Path, names: tuple[str, ...]) -> Cameras:
 def sparse_points(
     folder: Path, cameras: Cameras, *, count: int = 20_000, noise: float = 0.002, seed: int = 0
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Noisy surface points, as structure from motion would reconstruct: random pixels lifted by their depth.
+    """Unproject random pixels by their depth to noisy surface points, as a stand-in for structure from motion.
 
-    `count` over all cameras, at most; `noise` is the deviation of the depth as a share of it. Gives positions in metres
-    and sRGB colours; the sky has no points.
+    Args:
+        folder: Pictures and depth maps of a take.
+        cameras: Its cameras.
+        count: Maximum number of points over all cameras.
+        noise: Standard deviation of the depth, relative to the depth.
+        seed: Seed of pixels and noise.
+
+    Returns:
+        Positions in metres and sRGB colours; the sky has no points.
     """
     generator = np.random.default_rng(seed)
     points, colors = [], []
@@ -184,7 +194,7 @@ def sparse_points(
 
 
 def gather_capture(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], points: bool) -> None:
-    """Copy one take to the layout of a capture: images/, a folder per pass, transforms.json, points.ply."""
+    """Copy one take into a capture: images/, a folder per pass, transforms.json, points.ply."""
     count = len(json.loads((rendered / "cameras.json").read_text())["poses"])
     stems = tuple(f"{i:04d}" for i in range(count))
     for folder, suffix, ending in _PASS_FILES:
@@ -198,17 +208,12 @@ def gather_capture(rendered: Path, take: str, out: Path, *, passes: tuple[str, .
     write_capture(out, PosedImages(image_paths, cameras, found, colors, mask_paths if "masks" in passes else ()))
 
 
-_CLIPPED, _MAX_CLIPPED = 0.995, 0.6
-"""sRGB value from which a channel counts as clipped, and largest share of them in a sound picture; set by hand."""
-_MIN_MEAN, _MIN_DEVIATION = 0.02, 0.01
-"""Smallest mean and deviation of a sound picture, sRGB; set by hand."""
-_MIN_COVERED, _MAX_COVERED = 0.001, 0.7
-"""Share of a picture that the object covers; set by hand."""
+# folder of a capture, and the ends of the names of its files in a take and in the capture
 _PASS_FILES = (("images", ".png", ".png"), ("masks", "_mask.png", ".png"), ("depth", "_depth.npy", ".npy"))
 
 
 def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out: Path) -> None:
-    """Write one rendered scene as captures, with its placement, its true lights and the object's true surface."""
+    """Write one rendered scene as captures, with its placement, its true lights and surface points of the object."""
     gather_capture(source_render, "source", out / "source", passes=("images", "masks"), points=True)
     gather_capture(target_render, "target", out / "target", passes=("images",), points=True)
     passes = ("images", "masks", "depth")
@@ -234,7 +239,7 @@ def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out:
 
 
 def find_defect(folder: Path) -> str | None:
-    """Describe the first defect of a scene in one line, or None: a missing, broken, black, clipped or empty picture."""
+    """Describe the first missing, broken, black, clipped or empty picture of a scene in one line, or return None."""
     try:
         for name in ("ground_truth", "target", "source"):
             capture = read_capture(folder / name)
@@ -248,13 +253,13 @@ def find_defect(folder: Path) -> str | None:
 
 def _find_view_defect(capture: PosedImages, index: int, *, masked: bool) -> str | None:
     path, image = capture.image_paths[index], capture.image(index)
-    mean, deviation, clipped = float(image.mean()), float(image.std()), float((image > _CLIPPED).float().mean())
-    if mean < _MIN_MEAN or deviation < _MIN_DEVIATION or clipped > _MAX_CLIPPED:
+    mean, deviation, clipped = float(image.mean()), float(image.std()), float((image > 0.995).float().mean())
+    if mean < 0.02 or deviation < 0.01 or clipped > 0.6:  # set by hand, like the limits of the mask
         found = f"mean {mean:.3f}, deviation {deviation:.3f}, {clipped:.0%} clipped"
         return f"{path}: expected a lit picture, found {found}"
     mask = capture.mask(index) if masked else None
     if masked and mask is None:
         return f"{path}: expected a mask beside it, found none"
-    if mask is not None and not _MIN_COVERED <= float(mask.mean()) <= _MAX_COVERED:
+    if mask is not None and not 0.001 <= float(mask.mean()) <= 0.7:
         return f"{capture.mask_paths[index]}: expected a mask of 0.1% to 70%, found {float(mask.mean()):.2%}"
     return None

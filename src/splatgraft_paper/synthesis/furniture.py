@@ -1,6 +1,6 @@
-"""Random materials of a place, drawn around a few shared hues, and furniture made of them.
+"""Random materials of a place, drawn around a few shared hues, and furniture made of these materials.
 
-Each piece stands on the floor at the origin with its front towards -y.
+Each piece stands on the floor at the origin, its front towards -y.
 """
 
 import colorsys
@@ -27,7 +27,7 @@ def tone(rng: random.Random, hue: Number, saturation: tuple[float, float], value
 
 
 class Palette:
-    """The materials of one place: woods, walls, cloth and accents that share a few hues."""
+    """Materials of one place: woods, walls, cloth and accents that share a few hues."""
 
     def __init__(self, rng: random.Random):
         """Draw the shared hues."""
@@ -37,11 +37,11 @@ class Palette:
         self.wood_value = rng.uniform(0.28, 0.82)
 
     def _tone(self, hues: list[float], saturation: tuple[float, float], value: tuple[float, float]) -> Color:
-        """A tone near one of several hues."""
+        """Draw a colour near one of several hues."""
         return tone(self._rng, self._rng.choice(hues), saturation, value)
 
     def wall(self) -> Material:
-        """Painted plaster, mostly pale."""
+        """Make painted plaster, mostly pale."""
         if self._rng.random() < 0.25:
             color = tone(self._rng, self.accent_hue, (0.12, 0.4), (0.45, 0.75))
         else:
@@ -49,11 +49,11 @@ class Palette:
         return Material("plaster", color, (color[0] * 0.8, color[1] * 0.8, color[2] * 0.78), 0.85, bump=0.05)
 
     def ceiling(self) -> Material:
-        """Nearly white paint."""
+        """Make nearly white paint."""
         return Material("plaster", (0.78, 0.77, 0.74), (0.6, 0.6, 0.6), 0.9)
 
     def floor(self, kind: str) -> Material:
-        """Planks, tiles or stone, by the kind of room."""
+        """Make planks, tiles or stone, by the kind of room."""
         rng = self._rng
         wet: list[Pattern] = ["tiles", "marble", "tiles"]
         dry: list[Pattern] = ["planks", "planks", "planks", "tiles"]
@@ -65,7 +65,7 @@ class Palette:
         return Material(pattern, pale, joint, rng.uniform(0.08, 0.5), scale=rng.uniform(1.6, 3.5), bump=0.15)
 
     def wood(self, pattern: Pattern = "wood", scale: Number = 1.0) -> Material:
-        """Oak to walnut, varnished or oiled."""
+        """Make oak to walnut, varnished or oiled."""
         rng = self._rng
         value = min(0.9, max(0.18, self.wood_value + rng.gauss(0, 0.06)))
         color = tone(rng, 0.075, (0.4, 0.62), (value, value))
@@ -74,14 +74,14 @@ class Palette:
         return Material(pattern, color, dark, roughness, scale=scale, bump=0.12, coat=rng.choice([0.0, 0.0, 0.4]))
 
     def cloth(self, pattern: Pattern | None = None) -> Material:
-        """Upholstery, curtains, bedding."""
+        """Make cloth for upholstery, curtains or bedding."""
         color = self._tone([self.accent_hue, self.second_hue, 0.09], (0.08, 0.6), (0.25, 0.85))
         second = tone(self._rng, self.second_hue, (0.05, 0.4), (0.4, 0.9))
         patterns: list[Pattern] = ["fabric", "fabric", "fabric", "stripes", "checker"]
         return Material(pattern or self._rng.choice(patterns), color, second, 0.9, bump=0.35)
 
     def rug(self) -> Material:
-        """A rug with a visible pattern."""
+        """Make a rug's pattern."""
         rng = self._rng
         color = tone(rng, self.accent_hue, (0.2, 0.65), (0.3, 0.7))
         second = tone(rng, self.second_hue, (0.1, 0.5), (0.5, 0.9))
@@ -89,18 +89,18 @@ class Palette:
         return Material(pattern, color, second, 0.95, bump=0.5, scale=rng.uniform(0.7, 1.6))
 
     def paint(self) -> Material:
-        """Lacquer on furniture."""
+        """Make lacquer for furniture."""
         color = self._tone([self.accent_hue, self.second_hue, 0.1], (0.02, 0.55), (0.25, 0.95))
         return Material("plain", color, color, self._rng.uniform(0.15, 0.5), coat=self._rng.choice([0.0, 0.6]))
 
     def metal(self) -> Material:
-        """Steel, brass, blackened iron."""
+        """Make steel, brass, copper or blackened iron."""
         rng = self._rng
         color = rng.choice([(0.62, 0.62, 0.64), (0.75, 0.53, 0.25), (0.06, 0.06, 0.065), (0.7, 0.38, 0.25)])
         return Material("metal", color, color, rng.uniform(0.12, 0.45), metallic=1.0)
 
     def stone(self) -> Material:
-        """Counters, basins, paving."""
+        """Make stone for counters, basins or paving."""
         rng = self._rng
         color = self._tone([0.08, 0.6], (0.02, 0.12), (0.35, 0.9))
         vein = tone(rng, 0.08, (0.05, 0.2), (0.15, 0.6))
@@ -108,12 +108,12 @@ class Palette:
         return Material(pattern, color, vein, rng.uniform(0.1, 0.6), scale=rng.uniform(0.6, 1.6))
 
     def ceramic(self) -> Material:
-        """Glazed crockery and sanitary ware."""
+        """Make glaze for crockery and sanitary ware."""
         color = self._tone([self.accent_hue, 0.1], (0.0, 0.35), (0.6, 0.95))
         return Material("plain", color, color, 0.18, coat=0.7)
 
     def anything(self) -> Material:
-        """Any material of a small object."""
+        """Make a random material for a small object."""
         return self._rng.choice([self.wood, self.paint, self.metal, self.ceramic, self.stone, self.cloth])()
 
 
@@ -121,7 +121,7 @@ Parts = tuple[Part, ...]
 
 
 def placed(parts: Parts, location: Vector, yaw: Number) -> Parts:
-    """Rotate parts about z by `yaw` radians, then move them."""
+    """Rotate parts about z by `yaw`, radians, then translate them."""
 
     def moved(part: Part) -> Part:
         x, y, z = part.rotation
@@ -131,12 +131,12 @@ def placed(parts: Parts, location: Vector, yaw: Number) -> Parts:
 
 
 def box(size: Vector, location: Vector, material: Material, bevel: Number = 0.004) -> Part:
-    """A box with slightly rounded edges."""
+    """Make a box with slightly rounded edges."""
     return Part(shape="box", size=size, location=location, material=material, bevel=bevel)
 
 
 def legs(width: Number, depth: Number, height: Number, thick: Number, material: Material) -> Parts:
-    """Four square legs under the corners of a rectangle, metres."""
+    """Make four square legs under the corners of a rectangle, metres."""
     x, y = width / 2 - thick, depth / 2 - thick
     return tuple(
         box((thick, thick, height), (sx * x, sy * y, height / 2), material) for sx in (-1, 1) for sy in (-1, 1)
@@ -144,7 +144,7 @@ def legs(width: Number, depth: Number, height: Number, thick: Number, material: 
 
 
 def table(rng: random.Random, palette: Palette, width: Number, depth: Number, height: Number) -> Parts:
-    """A table with four legs or a round foot."""
+    """Make a table with four legs or a round foot."""
     top = rng.choice([palette.wood, palette.wood, palette.stone, palette.paint])()
     thick = rng.uniform(0.025, 0.05)
     if rng.random() < 0.3:
@@ -161,7 +161,7 @@ def table(rng: random.Random, palette: Palette, width: Number, depth: Number, he
 
 
 def sofa(rng: random.Random, palette: Palette, width: Number = 1.9) -> Parts:
-    """A sofa with seat, back, arms and loose cushions."""
+    """Make a sofa with seat, back, arms and loose cushions."""
     cloth, wood = palette.cloth("fabric"), palette.wood()
     depth, seat = 0.86, 0.42
     parts = [
@@ -182,7 +182,7 @@ def sofa(rng: random.Random, palette: Palette, width: Number = 1.9) -> Parts:
 
 
 def chair(rng: random.Random, palette: Palette) -> Parts:
-    """A dining chair."""
+    """Make a dining chair."""
     frame = rng.choice([palette.wood, palette.paint, palette.metal])()
     pad = palette.cloth()
     back = [box((0.035, 0.03, 0.45), (s * 0.19, 0.2, 0.68), frame) for s in (-1, 1)]
@@ -192,7 +192,7 @@ def chair(rng: random.Random, palette: Palette) -> Parts:
 
 
 def shelf(rng: random.Random, palette: Palette, width: Number = 0.9, height: Number = 1.8) -> Parts:
-    """A shelf with books and small things."""
+    """Make a shelf with books and balls."""
     wood = rng.choice([palette.wood, palette.paint])()
     depth, thick = 0.3, 0.022
     parts = [box((thick, depth, height), (s * width / 2, 0, height / 2), wood) for s in (-1, 1)]
@@ -221,7 +221,7 @@ def shelf(rng: random.Random, palette: Palette, width: Number = 0.9, height: Num
 
 
 def cabinet(rng: random.Random, palette: Palette, width: Number, height: Number, depth: Number = 0.45) -> Parts:
-    """A cabinet with doors or drawers and handles."""
+    """Make a cabinet with doors or drawers and handles."""
     body, handle = rng.choice([palette.wood, palette.paint, palette.paint])(), palette.metal()
     parts = [box((width, depth, height), (0, 0, height / 2), body)]
     columns, rows = max(1, round(width / 0.5)), rng.choice([1, 2, 3])
@@ -235,7 +235,7 @@ def cabinet(rng: random.Random, palette: Palette, width: Number, height: Number,
 
 
 def counter(rng: random.Random, palette: Palette, width: Number) -> Parts:
-    """A kitchen counter with a stone top, tap and splash-back."""
+    """Make a kitchen counter with a stone top, tap and splash-back."""
     body = cabinet(rng, palette, width, 0.86, 0.58)
     top, metal = palette.stone(), palette.metal()
     tiles = Material("tiles", tone(rng, palette.accent_hue, (0.0, 0.3), (0.6, 0.9)), (0.6, 0.6, 0.58), 0.15, scale=6.0)
@@ -252,7 +252,7 @@ def counter(rng: random.Random, palette: Palette, width: Number) -> Parts:
 
 
 def bed(rng: random.Random, palette: Palette) -> Parts:
-    """A double bed, made."""
+    """Make a double bed with bedding."""
     wood, sheet, blanket = palette.wood(), palette.cloth("fabric"), palette.cloth()
     parts = [
         box((1.5, 2.05, 0.24), (0, 0, 0.22), wood, 0.01),
@@ -267,7 +267,7 @@ def bed(rng: random.Random, palette: Palette) -> Parts:
 
 
 def bathtub(rng: random.Random, palette: Palette) -> Parts:
-    """A bathtub with a tiled front."""
+    """Make a bathtub with a tiled front."""
     white = palette.ceramic()
     tiles = Material("tiles", tone(rng, palette.accent_hue, (0.0, 0.4), (0.5, 0.9)), (0.7, 0.7, 0.68), 0.2, scale=7.0)
     rim = [box((1.7, 0.07, 0.06), (0, s * 0.34, 0.57), white, 0.02) for s in (-1, 1)]
@@ -278,7 +278,7 @@ def bathtub(rng: random.Random, palette: Palette) -> Parts:
 
 
 def basin(rng: random.Random, palette: Palette) -> Parts:
-    """A washstand with a bowl and a mirror above."""
+    """Make a washstand with a bowl and a mirror above it."""
     mirror = Material("metal", (0.85, 0.86, 0.87), roughness=0.02, metallic=1.0)
     bowl = ((0.0, 0.0), (0.6, 0.05), (0.95, 0.7), (1.0, 1.0), (0.9, 0.95), (0.55, 0.25), (0.0, 0.15))
     return (
@@ -290,7 +290,7 @@ def basin(rng: random.Random, palette: Palette) -> Parts:
 
 
 def plant(rng: random.Random, palette: Palette, height: Number) -> Parts:
-    """A pot with leaves."""
+    """Make a potted plant."""
     green = tone(rng, 0.29, (0.4, 0.7), (0.25, 0.55))
     leaf = Material("plain", green, (green[0] * 0.5, green[1] * 0.6, green[2] * 0.5), 0.45)
     soil = Material("plaster", (0.03, 0.02, 0.012), (0.01, 0.01, 0.01), 0.95, bump=0.5)
@@ -305,7 +305,7 @@ def plant(rng: random.Random, palette: Palette, height: Number) -> Parts:
 
 
 def floor_lamp(rng: random.Random, palette: Palette) -> tuple[Parts, Lamp]:
-    """A standing lamp and the light inside its shade."""
+    """Make a standing lamp and the light inside its shade."""
     metal = palette.metal()
     glow = Material("fabric", (0.95, 0.75, 0.5), (0.8, 0.6, 0.4), 0.9, emission=rng.uniform(0.6, 1.6))
     shade = ((0.75, 0.0), (1.0, 0.0), (0.7, 1.0), (0.6, 1.0))
@@ -319,7 +319,7 @@ def floor_lamp(rng: random.Random, palette: Palette) -> tuple[Parts, Lamp]:
 
 
 def picture(rng: random.Random, palette: Palette) -> Parts:
-    """A framed picture that hangs, centred at the origin."""
+    """Make a framed picture, centred at the origin."""
     w, h = rng.uniform(0.35, 0.9), rng.uniform(0.35, 0.8)
     a, b = tone(rng, rng.random(), (0.2, 0.7), (0.3, 0.9)), tone(rng, rng.random(), (0.2, 0.7), (0.2, 0.8))
     return (
@@ -329,7 +329,7 @@ def picture(rng: random.Random, palette: Palette) -> Parts:
 
 
 def tabletop(rng: random.Random, palette: Palette, top: Part) -> Parts:
-    """A few small objects near the edge of a table's top, on z = 0; the middle stays free."""
+    """Make a few small objects near the edge of a table's top, on z = 0; the middle stays free."""
     parts: list[Part] = []
     width, depth = top.size[:2]
     for _ in range(rng.randint(1, 4)):

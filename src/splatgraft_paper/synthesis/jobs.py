@@ -1,4 +1,4 @@
-"""Render jobs, their rendering in Blender processes, and the checks and failure lists of the folders they write."""
+"""Render jobs, their rendering in Blender processes, and lists of failures."""
 
 import json
 import subprocess
@@ -18,7 +18,7 @@ _WORKER = Path(__file__).parent / "blender" / "worker.py"
 
 @dataclass(frozen=True)
 class RenderSize:
-    """Size and sampling of pictures."""
+    """Size and sampling of rendered pictures."""
 
     width: int = 704
     height: int = 496
@@ -28,46 +28,48 @@ class RenderSize:
 
 @dataclass(frozen=True)
 class SurfaceSampling:
-    """Sampling of points on surfaces, uniform by area, within a sphere; metres."""
+    """Sampling of surface points, uniform by area, within a sphere; metres."""
 
     count: int
     center: Vector
-    radius: float
+    radius: float = 8.0
+    """Radius of the sphere, larger than any object."""
 
 
 @dataclass(frozen=True)
 class Take:
-    """One set of pictures of a job, from all its cameras; or a measurement."""
+    """One set of pictures of a job, from all its cameras, or a measurement of light or surfaces."""
 
     name: str
     """Name of the take and of its folder."""
     scene: bool
     """Whether the scene is rendered; without it the background is transparent."""
     object: str = ""
-    """The object that is rendered; none where empty."""
+    """Name of the rendered object; empty for none."""
     passes: tuple[Pass, ...] = ("color",)
     exposure_group: str = "scene"
-    """Takes of one group share one exposure, computed from the first of them."""
+    """Group of takes that share one exposure, computed from the first of them."""
     world: World | None = None
-    """Replaces the scene's world."""
+    """World that replaces the scene's."""
     probe: Vector | None = None
-    """Instead of pictures: the light at this point, `0000.npy` (64, 128, 3) and `suns.json`.
+    """Point whose light is measured instead of pictures: `0000.npy` (64, 128, 3) and `suns.json`.
 
     The panorama is linear light at the exposure of the pictures: row 0 is straight up, the middle column +x, and
-    columns run to the right as seen from inside. Suns are left out of it and listed in `suns.json`."""
+    columns run to the right as seen from inside. It leaves out the suns, which `suns.json` lists."""
     surface: SurfaceSampling | None = None
-    """Instead of pictures: points on the object, or on the scene where no object is named, `0000.npy` (n, 6): position
-    and outward normal, world axes."""
+    """Sampling of surface points instead of pictures: `0000.npy` (n, 6), position and outward normal, world axes.
+
+    Points lie on the object, or on the scene if no object is named."""
 
     @property
     def is_pictures(self) -> bool:
-        """Whether the take is rendered from cameras."""
+        """Whether the take is rendered from the cameras."""
         return self.probe is None and self.surface is None
 
 
 @dataclass(frozen=True)
 class Job:
-    """The description of what one Blender process renders."""
+    """Description of the pictures that one Blender process renders."""
 
     scene: Scene
     objects: dict[str, tuple[Part, ...]]
@@ -76,10 +78,10 @@ class Job:
     size: RenderSize
     seed: int = 0
     provenance: dict[str, str] = field(default_factory=dict)
-    """Seeds, kinds and licences, written beside the pictures."""
+    """Seeds, kinds and licences; written beside the pictures."""
 
     def is_done(self, out: Path) -> bool:
-        """Whether everything is rendered; a file marks each picture of a take."""
+        """Return whether everything is rendered; a .done file marks each finished picture."""
         counts = {take.name: len(self.cameras) if take.is_pictures else 1 for take in self.takes}
         return all((out / name / f"{i:04d}.done").exists() for name, count in counts.items() for i in range(count))
 
@@ -93,7 +95,7 @@ def _description(job: Job, out: Path) -> str:
 
 
 def render_job(job: Job, out: Path, blender_python: Path) -> None:
-    """Render what is missing in `out`, beside job.json and render.log; can be interrupted and repeated."""
+    """Render what is missing in `out`, and write job.json and render.log; an interrupted job can be repeated."""
     if job.is_done(out):
         return
     out.mkdir(parents=True, exist_ok=True)
@@ -108,7 +110,7 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
 
 
 def check_blender(blender_python: Path) -> str:
-    """Return Blender's version in that interpreter."""
+    """Return the version of Blender in a Python interpreter."""
     command = [str(blender_python), "-c", "import bpy; print('version', bpy.app.version_string)"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -124,34 +126,31 @@ def check_blender(blender_python: Path) -> str:
     return found[-1].removeprefix("version ")
 
 
-_SHOWN_FAILURES = 10
-
-
 @dataclass(frozen=True)
 class RenderWorkers:
-    """The Blender processes that render."""
+    """Blender processes that render."""
 
     blender_python: Path | None = None
-    """A Python 3.11 that has bpy; this one where not given."""
+    """Python 3.11 with bpy; default: the running interpreter."""
     processes: int = 2
-    """Blender processes at a time on this machine."""
+    """Number of Blender processes at a time on this machine."""
     ray: str | None = None
-    """Address of a Ray cluster whose machines all see the folder; `local` for one of this machine's cores."""
+    """Address of a Ray cluster whose machines all see the folder; `local`: one of this machine's cores."""
 
     def python(self, console: Console) -> Path:
-        """The interpreter, after a trial import of bpy."""
+        """Return the interpreter after a trial import of bpy."""
         found = self.blender_python or Path(sys.executable)
         console.say(f"blender: {check_blender(found)} in {found}")
         return found
 
     def run(self, tasks: list[Task], console: Console) -> list[str]:
-        """Render, and return one line per task that failed."""
+        """Render, and return one line per failed task."""
         with console.bar("render") as progress:
             return run_tasks(tasks, at_once=self.processes, ray_address=self.ray, progress=progress)
 
 
 def parse_image_size(text: str, *, multiple_of: int = 1) -> tuple[int, int]:
-    """Parse --size WIDTHxHEIGHT; both must be multiples of `multiple_of` pixels."""
+    """Parse --size WIDTHxHEIGHT; both sides must be multiples of `multiple_of` pixels."""
     parts = text.split("x")
     if len(parts) != 2 or not all(part.isdigit() and int(part) and int(part) % multiple_of == 0 for part in parts):
         wanted = "WIDTHxHEIGHT" if multiple_of == 1 else f"WIDTHxHEIGHT in multiples of {multiple_of}"
@@ -160,7 +159,7 @@ def parse_image_size(text: str, *, multiple_of: int = 1) -> tuple[int, int]:
 
 
 def read_render_size(text: str, samples: int) -> RenderSize:
-    """Parse WIDTHxHEIGHT of pictures that Blender is to render."""
+    """Parse the size WIDTHxHEIGHT of rendered pictures."""
     size = parse_image_size(text)
     if min(*size, 16 * samples) < 16:
         raise ValueError(f"--size, --samples: expected at least 16x16 and one sample, found {text}, {samples}")
@@ -168,11 +167,11 @@ def read_render_size(text: str, samples: int) -> RenderSize:
 
 
 def write_failures(out: Path, failures: list[str], console: Console) -> None:
-    """Write failures.txt, or remove it where nothing failed, and say the first lines."""
+    """Write failures.txt and print its first lines; remove the file if nothing failed."""
     path = out / "failures.txt"
     path.unlink(missing_ok=True)
     if failures:
         path.write_text("\n".join(failures) + "\n")
-        for failure in failures[:_SHOWN_FAILURES]:
+        for failure in failures[:10]:
             console.say(failure)
         console.say(f"{len(failures)} failures, all in {path}")

@@ -1,16 +1,15 @@
-"""Random objects to insert: turned, extruded and blob shapes, also stacked, of many materials; they stand on z = 0."""
+"""Random objects to insert: turned, extruded and blob shapes, single or stacked, of many materials, on z = 0."""
 
 import math
 import random
 from dataclasses import replace
-from pathlib import Path
 
 from splatgraft_paper.synthesis.furniture import Palette, tone
 from splatgraft_paper.synthesis.scene import Material, Number, Part, Pattern, Place, Shape, add, rotate_z
 
 
 def _profile(rng: random.Random) -> tuple[tuple[float, float], ...]:
-    """A smooth vase-like profile, closed at the bottom, open at the top."""
+    """Draw a smooth vase-like profile, closed at the bottom, open at the top."""
     waves = [(rng.uniform(0.05, 0.28), rng.uniform(1, 5), rng.uniform(0, 6.3)) for _ in range(3)]
     radii = [0.6 + sum(a * math.sin(f * i / 12 * math.pi + p) for a, f, p in waves) for i in range(13)]
     radii = [max(0.18, r) for r in radii]
@@ -21,7 +20,7 @@ def _profile(rng: random.Random) -> tuple[tuple[float, float], ...]:
 
 
 def _outline(rng: random.Random) -> tuple[tuple[float, float], ...]:
-    """A star-like or rounded polygon."""
+    """Draw a star-like or rounded polygon."""
     corners, depth, phase = rng.randint(3, 9), rng.uniform(0.0, 0.35), rng.uniform(0, 6.3)
     count = corners * 4
     points = []
@@ -33,7 +32,7 @@ def _outline(rng: random.Random) -> tuple[tuple[float, float], ...]:
 
 
 def _surface(rng: random.Random, palette: Palette) -> Material:
-    """A random material: metal, glossy, matt or patterned."""
+    """Draw a material: metal, glossy, matt, wood, stone or patterned."""
     kind = rng.choice(["metal", "glossy", "matt", "pattern", "pattern", "wood", "stone"])
     a, b = tone(rng, rng.random(), (0.15, 0.85), (0.25, 0.9)), tone(rng, rng.random(), (0.1, 0.7), (0.3, 0.95))
     if kind == "metal":
@@ -78,7 +77,7 @@ def _handle(rng: random.Random, palette: Palette, width: Number, height: Number)
 
 
 def make(seed: int, place: Place) -> tuple[Part, ...]:
-    """Make an object of one to three stacked pieces, possibly with a handle, that stands at the origin."""
+    """Make an object of one to three stacked pieces, possibly with a handle, standing at the origin."""
     rng = random.Random(f"object-{seed}")
     palette = Palette(rng)
     total = min(place.height * 0.6, rng.uniform(0.16, 0.55))
@@ -96,11 +95,3 @@ def make(seed: int, place: Place) -> tuple[Part, ...]:
     if rng.random() < 0.4:
         parts.append(_handle(rng, palette, widths[0], total * shares[0] / sum(shares)))
     return tuple(parts)
-
-
-def from_file(path: Path, place: Place) -> tuple[Part, ...]:
-    """Make an object from a model file, scaled to fit `place`; it stands at the origin."""
-    height = min(place.height * 0.6, 0.5)
-    size = (1.9 * place.radius, 1.9 * place.radius, height)
-    any_material = Material("plain", (0.5, 0.5, 0.5))
-    return (Part("model", size, (0, 0, height / 2), any_material, path=str(path)),)

@@ -1,6 +1,6 @@
-"""Training pairs (paper, Sec. 5.1 and 5.2): planned as render jobs, and read as composite and target.
+"""Training pairs (paper, Sec. 5.1 and 5.2), planned as render jobs and read as composite and target.
 
-One folder per scene and camera arc, `<out>/<scene>_<arc>/`:
+Files of a scene and camera arc, in `<out>/<scene>_<arc>/`:
 
     job.json, cameras.json, exposure.json    what was rendered, poses (OpenGL axes), exposures
     background/0000.png ...                  the scene without any object, 8-bit sRGB, one file per camera
@@ -34,14 +34,10 @@ from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Ta
 from splatgraft_paper.synthesis.places import KINDS, SUPPLIED_MAPS, make_scene
 from splatgraft_paper.synthesis.scene import ARC_LENGTH, World, add, camera_arc
 
-_OBJECT_POINTS, _SCENE_POINTS = 12_000, 100_000
-"""Sampled points per object and per scene."""
 PAPER_SCENES, PAPER_LIGHTS = 190, 27
-"""With two objects a scene: the paper's 1,900 targets and a little over its 51,000 composites."""
-_SECONDS_PER_SAMPLE = 7.5e-6
-"""CPU seconds of a path of a furnished room: 336 for 704x496 pixels with 128 samples on an AMD EPYC."""
-_ALONE_SHARE = 0.1  # time of an object alone over that of its scene
-_SURFACE_RADIUS = 8.0  # metres around the object within which surface points are sampled
+"""Numbers of scenes and lights; two objects a scene make the paper's 1,900 targets and over 51,000 composites."""
+_SECONDS_PER_SAMPLE = 7.5e-6  # CPU seconds per light path; 704x496 pixels with 128 samples took 336 s on an AMD EPYC
+_ALONE_SHARE = 0.1  # render time of an object alone, relative to its scene
 
 
 @dataclass(frozen=True)
@@ -49,49 +45,44 @@ class PairPlan:
     """Options of a set of pairs; a scene gives 5 cameras x objects x lights pairs."""
 
     objects: int = 2
-    """Per scene; the background is rendered once for all."""
+    """Objects per scene; the background is rendered once for all."""
     lights: int = 3
     """Environment maps per object."""
     seed: int = 0
     size: RenderSize = field(default_factory=RenderSize)
     maps: tuple[str, ...] = SUPPLIED_MAPS
-    """Environment maps: files, or names of those that come with Blender."""
-    models: tuple[str, ...] = ()
-    """Model files, used for about half of the objects."""
+    """Environment maps: files, or names of maps that come with Blender."""
 
     @property
     def targets(self) -> int:
-        """Consistent pictures of a scene."""
+        """Number of consistent pictures of a scene."""
         return ARC_LENGTH * self.objects
 
     @property
     def composites(self) -> int:
-        """Inconsistent pictures of a scene."""
+        """Number of inconsistent pictures of a scene."""
         return self.targets * self.lights
 
     @property
     def cpu_seconds(self) -> float:
-        """Of rendering a scene, within about a factor of 2."""
+        """CPU seconds to render a scene, within about a factor of 2."""
         pictures = ARC_LENGTH + self.targets + _ALONE_SHARE * self.composites
         return pictures * _SECONDS_PER_SAMPLE * self.size.samples * self.size.width * self.size.height
 
 
 def plan(options: PairPlan, number: int) -> Job:
-    """Plan the job of scene `number`, determined by it and the seed."""
+    """Plan the job of scene `number`; it follows from the number and the seed."""
     rng = random.Random(f"pairs-{options.seed}-{number}")
     kind = KINDS[number % len(KINDS)]
     scene = make_scene(kind, options.seed * 100_003 + number)
     place = scene.places[0]
     things, heights = {}, []
     for i in range(options.objects):
-        if options.models and rng.random() < 0.5:
-            parts = objects.from_file(Path(rng.choice(options.models)), place)
-        else:
-            parts = objects.make(rng.randrange(2**31), place)
+        parts = objects.make(rng.randrange(2**31), place)
         heights.append(max(part.location[2] + part.size[2] / 2 for part in parts))
         things[f"object{i}"] = placed(parts, place.location, rng.uniform(0, 6.283))
     middle = add(place.location, (0, 0, 0.5 * max(heights)))
-    on_object, on_scene = (SurfaceSampling(n, middle, _SURFACE_RADIUS) for n in (_OBJECT_POINTS, _SCENE_POINTS))
+    on_object, on_scene = SurfaceSampling(12_000, middle), SurfaceSampling(100_000, middle)
     takes = [Take("background", scene=True)]
     for name in things:
         takes.append(Take(name, scene=True, object=name, passes=("color", "mask", "depth", "normal", "albedo")))
@@ -108,13 +99,13 @@ def plan(options: PairPlan, number: int) -> Job:
 
 
 def job_folder_name(job: Job) -> str:
-    """Name of the job's folder."""
+    """Return the name of the job's folder."""
     return f"{job.scene.name}_{job.seed:05d}"
 
 
 @dataclass(frozen=True)
 class PairSample:
-    """One training pair on disk, by folder, camera, object and light."""
+    """One training pair on disk, identified by folder, camera, object and light."""
 
     folder: Path
     camera: int
@@ -122,7 +113,7 @@ class PairSample:
     light: str
 
     def path(self, take: str, kind: str = "") -> Path:
-        """Path of a take's pass for this camera."""
+        """Return the path of a take's pass for this camera."""
         suffix = ".npy" if kind == "depth" else ".png"
         return self.folder / take / f"{self.camera:04d}{'_' + kind if kind else ''}{suffix}"
 
@@ -130,7 +121,7 @@ class PairSample:
 def match_statistics(
     relit: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """Shift and scale the relit object to the mean and deviation per channel of the object in the scene (Sec. 5.2)."""
+    """Match the relit object's mean and deviation per channel to those of the object in the scene (Sec. 5.2)."""
     weight = mask[..., None] / mask.sum().clamp_min(1e-6)
 
     def moments(image: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
@@ -144,12 +135,12 @@ def match_statistics(
 def composite(
     relit: Float[Tensor, "h w 3"], background: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """M * relit + (1 - M) * background (paper, Eq. 2); `relit` is not multiplied by its coverage M in [0, 1]."""
+    """Compute M * relit + (1 - M) * background (paper, Eq. 2); `relit` is not multiplied by its coverage M."""
     return mask[..., None] * relit + (1 - mask[..., None]) * background
 
 
 def samples_in(folder: Path) -> list[PairSample]:
-    """List all pairs of a rendered folder by its job.json."""
+    """List all pairs of a rendered folder, from its job.json."""
     path = folder / "job.json"
     try:
         job = json.loads(path.read_text())
@@ -161,7 +152,7 @@ def samples_in(folder: Path) -> list[PairSample]:
 
 
 def find_defect(sample: PairSample) -> str | None:
-    """Describe the first defect of a pair in one line, or None: a missing, broken, empty, black or clipped picture."""
+    """Describe the first missing, broken, empty, black or clipped picture of a pair in one line, or return None."""
     target_path, background_path = sample.path(sample.object), sample.path("background")
     mask_path, relit_path = sample.path(sample.object, "mask"), sample.path(f"{sample.object}_{sample.light}")
     depth_path = sample.path(sample.object, "depth")
@@ -194,7 +185,7 @@ def find_defect(sample: PairSample) -> str | None:
 
 
 def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
-    """Check every pair and write manifest.jsonl; gives the number of sound pairs and the defects of the others."""
+    """Check every pair, write manifest.jsonl, and return the number of sound pairs and the defects of the others."""
     defects, lines = [], []
     for folder in folders:
         provenance = json.loads((folder / "job.json").read_text()).get("provenance", {})
@@ -210,7 +201,7 @@ def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
 
 
 def read_manifest(out: Path) -> list[PairSample]:
-    """Read the sound pairs of a folder."""
+    """Read the sound pairs of a folder from its manifest."""
     path = out / "manifest.jsonl"
     if not path.is_file():
         raise ValueError(f"{path}: expected the manifest of rendered pairs, found none (splatgraft paper synth pairs)")
@@ -226,7 +217,7 @@ def read_manifest(out: Path) -> list[PairSample]:
 
 
 def check_pairs(out: Path, failures: list[str], console: Console) -> int:
-    """Check all rendered scenes in `out`, write the manifest and the failures; 1 where there are any, otherwise 0."""
+    """Check all rendered scenes in `out` and write the manifest and the failures; return 1 if there are any, else 0."""
     folders = sorted(path.parent for path in out.glob("*/job.json"))
     if not folders and not failures:
         raise ValueError(f"{out}: expected rendered pairs or benchmark scenes, found none")

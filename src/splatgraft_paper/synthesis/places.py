@@ -1,4 +1,4 @@
-"""Random places: five kinds of furnished rooms lit by window, sun and lamps, and three outdoors under sky or map."""
+"""Random places: five kinds of furnished rooms, lit by window, sun and lamps, and three outdoors, by sky or map."""
 
 import math
 import random
@@ -33,21 +33,21 @@ class _Shell:
     depth: Number
     height: Number
     window_center: Number
-    """Along x, on the wall at +y."""
+    """Centre along x, on the wall at +y."""
     window_width: Number
     sill: Number
     window_height: Number
 
 
 class _FloorPlan:
-    """The occupied rectangles of the floor."""
+    """Occupied rectangles of the floor."""
 
     def __init__(self, shell: _Shell):
         self._occupied: list[tuple[float, float, float, float]] = []
         self._shell = shell
 
     def occupy(self, x: Number, y: Number, width: Number, depth: Number, margin: Number = 0.05) -> bool:
-        """Occupy a rectangle; False, and unchanged, where it is not free or leaves the room."""
+        """Occupy a rectangle; return False, unchanged, if it is not free or leaves the room."""
         low_x, high_x, low_y, high_y = x - width / 2, x + width / 2, y - depth / 2, y + depth / 2
         half_w, half_d = self._shell.width / 2, self._shell.depth / 2
         if low_x < -half_w or high_x > half_w or low_y < -half_d or high_y > half_d:
@@ -59,7 +59,7 @@ class _FloorPlan:
         return True
 
     def boxes(self, first: Number, others: Number) -> tuple[tuple[Vector, Vector], ...]:
-        """All occupied rectangles as boxes on the floor: the first one of height `first`, the others of `others`."""
+        """Extend all occupied rectangles to boxes on the floor: the first of height `first`, the others of `others`."""
         return tuple(((a, c, 0.0), (b, d, others if i else first)) for i, (a, b, c, d) in enumerate(self._occupied))
 
 
@@ -100,7 +100,7 @@ def _walls(rng: random.Random, palette: Palette, shell: _Shell, kind: str) -> Pa
 
 
 def _centre(rng: random.Random, palette: Palette, kind: Interior) -> tuple[Parts, Place, tuple[float, float]]:
-    """The support of the object near the middle of the room, its place, and its footprint."""
+    """Make the object's support near the middle of the room, and return its parts, place and footprint."""
     if kind == "bedroom" and rng.random() < 0.5:
         rug = Part("box", (1.7, 1.3, 0.015), (0, 0, 0.008), palette.rug(), bevel=0.005)
         return (rug,), Place((0, 0, 0.016), 0.5, 1.6), (0.9, 0.9)
@@ -162,7 +162,7 @@ def _against_walls(rng: random.Random, palette: Palette, kind: Interior, shell: 
 
 
 def _daylight(rng: random.Random, shell: _Shell, notes: dict[str, str]) -> tuple[list[Lamp], World]:
-    """Sky and possibly sun through the window with an area light in front of it; in the evening only a dark sky."""
+    """Draw daylight: an area light before the window and possibly sun, or only a dark sky in the evening."""
     middle = (shell.window_center, shell.depth / 2 + 0.25, shell.sill + shell.window_height / 2)
     mood = rng.choice(["sun", "sun", "sun", "overcast", "evening"])
     lamps: list[Lamp] = []
@@ -188,7 +188,7 @@ def _daylight(rng: random.Random, shell: _Shell, notes: dict[str, str]) -> tuple
 
 
 def interior(seed: int, kind: Interior) -> Scene:
-    """Make a furnished room; the same seed and kind give the same room."""
+    """Make a furnished room; seed and kind determine it."""
     rng = random.Random(f"{kind}-{seed}")
     palette = Palette(rng)
     widths, depths = ((2.6, 3.2), (2.8, 3.4)) if kind == "bathroom" else ((3.8, 5.4), (4.0, 5.6))
@@ -245,7 +245,7 @@ OUTDOORS: tuple[Outdoor, ...] = ("terrace", "garden", "square")
 SUPPLIED_MAPS = tuple(
     f"{name}.exr" for name in ("city", "courtyard", "forest", "sunrise", "sunset", "studio", "interior", "night")
 )
-"""Environment maps that come with Blender."""
+"""Names of environment maps that come with Blender."""
 
 
 def _tree(rng: random.Random) -> Parts:
@@ -273,7 +273,7 @@ def _hedge(rng: random.Random) -> Parts:
 
 
 def _meadow(rng: random.Random, lawn: Color) -> Parts:
-    """Tufts of grass around the centre, of four shapes, paler than the ground."""
+    """Make tufts of grass around the centre, of four shapes, paler than the ground."""
     paler = (min(0.7, lawn[0] * 1.9), min(0.8, lawn[1] * 1.8), min(0.5, lawn[2] * 1.6))
     blade = Material("plain", paler, lawn, 0.6)
     seeds = [rng.randrange(10**6) for _ in range(4)]
@@ -315,7 +315,7 @@ def _support(rng: random.Random, palette: Palette) -> tuple[Parts, Place]:
 
 
 def outdoor(seed: int, kind: Outdoor) -> Scene:
-    """Make an outdoor place; the same seed and kind give the same place."""
+    """Make an outdoor place; seed and kind determine it."""
     rng = random.Random(f"{kind}-{seed}")
     palette = Palette(rng)
     stone, joint = tone(rng, 0.08, (0.03, 0.25), (0.4, 0.75)), tone(rng, 0.08, (0.05, 0.2), (0.2, 0.5))

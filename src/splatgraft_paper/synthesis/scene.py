@@ -1,7 +1,7 @@
-"""The description of a synthetic scene: parts, materials, lamps, sky; and cameras in it.
+"""Description of a synthetic scene (parts, materials, lamps, sky), and cameras in it.
 
-All values are plain data (numbers, strings, tuples), in metres with z up, so that a scene is a small JSON file that
-Blender's interpreter can read. Colours are linear RGB.
+All values are numbers, strings and tuples, in metres with z up, because Blender's interpreter reads a scene as JSON.
+Colours are linear RGB.
 """
 
 import math
@@ -17,9 +17,7 @@ Pattern = Literal[
     "plain", "planks", "wood", "tiles", "brick", "fabric", "rug", "marble", "plaster", "speckle", "stripes", "checker",
     "painting", "grass", "metal",
 ]  # fmt: skip
-Shape = Literal[
-    "box", "cushion", "cylinder", "sphere", "turned", "extruded", "blob", "torus", "tuft", "foliage", "model"
-]
+Shape = Literal["box", "cushion", "cylinder", "sphere", "turned", "extruded", "blob", "torus", "tuft", "foliage"]
 
 
 @dataclass(frozen=True)
@@ -29,11 +27,11 @@ class Material:
     pattern: Pattern
     color: Color
     second: Color = (0.5, 0.5, 0.5)
-    """The pattern's other colour."""
+    """Second colour of the pattern."""
     roughness: Number = 0.5
     metallic: Number = 0.0
     scale: Number = 1.0
-    """Frequency of the pattern, relative to the pattern's default."""
+    """Frequency of the pattern, relative to its default."""
     bump: Number = 0.0
     """Strength of the bump map, 0 to 1."""
     coat: Number = 0.0
@@ -48,37 +46,35 @@ class Part:
 
     shape: Shape
     size: Vector
-    """Extent along the local axes, metres; turned and extruded shapes scale their unit profile by it."""
+    """Extent along the local axes, metres, also the scale of the unit profile of turned and extruded shapes."""
     location: Vector
     """Centre of the shape's bounding box."""
     material: Material
     rotation: Vector = (0.0, 0.0, 0.0)
     """Euler XYZ, radians."""
     profile: tuple[tuple[float, float], ...] = ()
-    """turned: (radius, height) in units of the half width and height, bottom to top; extruded: outline in [-.5, .5]."""
+    """Profile. turned: (radius, height) in half widths and heights, bottom to top; extruded: outline in [-.5, .5]."""
     bevel: Number = 0.0
     """Width of rounded edges, metres."""
     seed: int = 0
     """Seed of shapes with random details."""
-    path: str = ""
-    """model: a .glb, .gltf, .obj or .blend file."""
 
 
 @dataclass(frozen=True)
 class Lamp:
     """A light source without geometry."""
 
-    kind: Literal["sun", "area", "point", "spot"]
+    kind: Literal["sun", "area", "point"]
     color: Color
     power: Number
-    """sun: W/m^2; else W."""
+    """Power, W; of a sun W/m^2."""
     location: Vector = (0.0, 0.0, 0.0)
     direction: Vector = (0.0, 0.0, -1.0)
     """Direction in which the light travels; not used by `point`."""
     size: Number = 0.1
-    """area: side in metres; point and spot: radius in metres; sun: angular diameter in radians."""
+    """Side of an area, radius of a point, metres; angular diameter of a sun, radians."""
     height: Number = 0.0
-    """area: the other side of a rectangle, metres; 0 for a square."""
+    """Other side of a rectangular area, metres; 0 for a square."""
 
 
 @dataclass(frozen=True)
@@ -89,22 +85,22 @@ class World:
     color: Color = (0.0, 0.0, 0.0)
     strength: Number = 1.0
     sun_elevation: Number = 0.8
-    """sky: radians above the horizon."""
+    """Elevation of a sky's sun, radians above the horizon."""
     sun_azimuth: Number = 0.0
-    """sky: azimuth of the sun, radians from +x towards +y."""
+    """Azimuth of a sky's sun, radians from +x towards +y."""
     sun_size: Number = 0.0095
-    """sky: angular diameter, radians."""
+    """Angular diameter of a sky's sun, radians."""
     haze: Number = 1.0
-    """sky: amount of dust, 0 to 10."""
+    """Amount of dust in a sky, 0 to 10."""
     path: str = ""
-    """environment: an .hdr or .exr file; a bare name is one that comes with Blender."""
+    """Environment map, .hdr or .exr; a bare name is a map that comes with Blender."""
     rotation: Number = 0.0
-    """environment: radians about z."""
+    """Rotation of the environment map about z, radians."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """A place for an object on a support surface."""
+    """Place for an object on a support surface."""
 
     location: Vector
     radius: Number
@@ -115,17 +111,17 @@ class Place:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera that looks from one point at another, with z up in the image."""
+    """Pinhole camera at one point, looking at another, with z up in the image."""
 
     location: Vector
     target: Vector
     field_of_view: Number = 1.05
-    """Horizontal, radians."""
+    """Horizontal field of view, radians."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A whole scene; the object is put at `places[0]`."""
+    """A whole scene; objects are placed at `places[0]`."""
 
     name: str
     kind: str
@@ -136,7 +132,7 @@ class Scene:
     bounds: tuple[Vector, Vector]
     """Lowest and highest corner of the cameras' positions."""
     obstacles: tuple[tuple[Vector, Vector], ...] = ()
-    """Boxes without cameras inside."""
+    """Boxes that cameras avoid."""
     notes: dict[str, str] = field(default_factory=dict)
     """Description of the true light, for the benchmark's `scene.json`."""
 
@@ -148,28 +144,25 @@ def rotate_z(point: Vector, angle: Number) -> Vector:
 
 
 def add(a: Vector, b: Vector) -> Vector:
-    """Sum of two vectors."""
+    """Add two vectors."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 def direction(azimuth: Number, elevation: Number) -> Vector:
-    """Unit vector towards an azimuth (from +x towards +y) and an elevation above the horizon, radians."""
+    """Compute the unit vector towards an azimuth (from +x towards +y) and an elevation, radians."""
     flat = math.cos(elevation)
     return (flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation))
 
 
 ARC_LENGTH = 5
-"""Views per camera arc (paper, Sec. 5.2)."""
-_OBSTACLE_MARGIN = 0.12  # metres between cameras and obstacles
-_ARC_TRIES, _CAPTURE_TRIES = 400, 40
-"""Random draws of an arc, and per camera of a capture."""
+"""Number of views per camera arc (paper, Sec. 5.2)."""
 
 
 def _is_free(scene: Scene, eye: Vector) -> bool:
     low, high = scene.bounds
     if any(not low[i] <= eye[i] <= high[i] for i in range(3)):
         return False
-    margin = _OBSTACLE_MARGIN
+    margin = 0.12  # metres between cameras and obstacles
     return not any(all(a[i] - margin < eye[i] < b[i] + margin for i in range(3)) for a, b in scene.obstacles)
 
 
@@ -184,7 +177,7 @@ def camera_arc(scene: Scene, place: Place, object_height: Number, seed: int) -> 
     # outdoors, a camera that looks steeply down sees only the ground
     highest = 0.45 if scene.world.kind != "color" else 0.8
     target = add(place.location, (0, 0, 0.45 * object_height))
-    for _ in range(_ARC_TRIES):
+    for _ in range(400):
         azimuth, elevation = rng.uniform(0, 2 * math.pi), rng.uniform(0.12, highest)
         distance = max(0.55, object_height * rng.uniform(2.4, 5.0))
         sweep = rng.uniform(0.25, 0.6)
@@ -203,7 +196,7 @@ def capture_cameras(scene: Scene, place: Place, object_height: Number, count: in
     target = add(place.location, (0, 0, 0.4 * object_height))
     cameras: list[Camera] = []
     rings = 3
-    for i in range(count * _CAPTURE_TRIES):
+    for i in range(40 * count):
         if len(cameras) == count:
             break
         even_azimuth = 2 * math.pi * rings * len(cameras) / count

@@ -1,1 +1,1 @@
-"""The paper's tables on the authors' data set: what its folders hold, what is measured, what is run, the tables."""
+"""The paper's tables on the authors' data set: layout of its folders, measurements, our methods, and the report."""

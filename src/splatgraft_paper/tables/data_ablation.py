@@ -1,4 +1,4 @@
-"""The paper's Table 3: trained harmonisers on the test split of each source of training pairs."""
+"""The paper's Table 3: measures trained harmonisers on the test split of each source of training pairs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,35 +13,35 @@ from splatgraft.project.step import Device, choose_device
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft_paper.benchmark.image_features import frechet_distance, inception_features
-from splatgraft_paper.tables.measure_pictures import KnownView, measure_picture
+from splatgraft_paper.tables.measure_pictures import measure_picture
 from splatgraft_paper.training.pairs import DataOptions, TrainingPair, crop_pair_to_size, open_training_data
 
 SOURCES = {"pairs": "Blender", "generated": "FLUX", "orida": "ORIDa"}
-"""Option of a source to the paper's name of it."""
-_KEYS = {"psnr": "psnr_whole", "ssim": "ssim_padded_whole", "lpips": "lpips_whole"}
+"""The paper's name of each source, by the source's option."""
 
 
 @dataclass(frozen=True)
 class DataAblation:
-    """What is measured."""
+    """Models, sources and metrics of Table 3."""
 
     models: Mapping[str, Path]
-    """The paper's name of a row to the folder that `paper train flux` wrote."""
+    """Folders that `paper train flux` wrote, by the paper's name of the row."""
     data: DataOptions
-    """The sources; their held-out scenes are the test split."""
+    """Sources; their held-out scenes are the test split."""
     seed: int = 0
-    """That of the trainings, which decides what is held out."""
+    """Seed of the trainings, which determines the held-out scenes."""
     weights: Path | None = None
-    """Folder of LPIPS's and Inception's weights."""
+    """Folder with the weights of LPIPS and Inception."""
     metrics: frozenset[str] = frozenset({"psnr", "ssim", "lpips", "fid"})
-    """What is measured: those whose weights are there."""
+    """Metrics to measure; weights of all must exist."""
     device: Device = "auto"
 
 
 def measure_models(run: DataAblation, console: Console) -> dict[str, dict[str, float]]:
-    """Metrics of each model: `psnr Blender`, .., `fid ORIDa`, and their means over the sources as `psnr Average`.
+    """Measure each model: `psnr Blender`, .., `fid ORIDa`, and the means over the sources, `psnr Average`, ...
 
-    Raises: ValueError where a source has no held-out scene, or a model cannot be loaded.
+    Raises:
+        ValueError: A source has no held-out scene, or a model cannot be loaded.
     """
     tests = {name: _test_split(run, option) for option, name in SOURCES.items() if getattr(run.data, option)}
     if not tests:
@@ -57,13 +57,12 @@ def measure_models(run: DataAblation, console: Console) -> dict[str, dict[str, f
             rows, of_made, of_target = [], [], []
             for pair in pairs:
                 made = harmonizer.harmonize(_view_of(pair)).image.cpu()
-                rows.append(measure_picture(made, KnownView(truth=pair.target), perceptual))
+                rows.append(measure_picture(made, pair.target, perceptual))
                 if features is not None:
                     of_made.append(features([made]))
                     of_target.append(features([pair.target]))
-            for metric, key in _KEYS.items():
-                if metric in run.metrics:
-                    values[f"{metric} {source}"] = sum(row[key] for row in rows) / len(rows)
+            for metric in run.metrics - {"fid"}:
+                values[f"{metric} {source}"] = sum(row[metric] for row in rows) / len(rows)
             if features is not None:
                 values[f"fid {source}"] = frechet_distance(np.concatenate(of_made), np.concatenate(of_target))
             console.say(f"{model}, {source}: {values[f'psnr {source}']:.2f} dB on {len(pairs)} pairs")
@@ -74,7 +73,7 @@ def measure_models(run: DataAblation, console: Console) -> dict[str, dict[str, f
 
 
 def _test_split(run: DataAblation, option: str) -> Sequence[TrainingPair]:
-    """The held-out pairs of one source, at the size of the trainings, each read when it is asked for."""
+    """List the held-out pairs of one source at the size of the trainings; pairs are read on access."""
     alone = replace(run.data, **{other: () for other in SOURCES if other != option}, weights=())
     opened = open_training_data(alone, run.seed, None)
     if opened.held_out is None:

@@ -1,13 +1,14 @@
-"""The authors' published data set on disk: its scenes, what is known of each, and which pictures show the same view.
+"""The authors' published data set on disk: finds its scenes and their files, and matches pictures to views.
 
-The card of the data set names the folders down to SCENE; the names below it are ours, where the data are put so:
+The data set is nviolante/dot3d on Hugging Face, CC-BY 4.0. Its card names the folders down to SCENE. It does not
+name the files below SCENE; the names here are ours, so files may have to be renamed:
 
-    data_3d/{synthetic,real}/insertions/SCENE/      of SCENE = OBJECT_in_BACKGROUND
-        gt/  masks/  background/  composite/        pictures VIEW.png: with the object, its masks, without it, pasted
-        object.ply  background.ply                  trained Gaussians, the object where it is to stand
+    data_3d/{synthetic,real}/insertions/SCENE/      SCENE is OBJECT_in_BACKGROUND
+        gt/  background/  composite/                pictures VIEW.png: with the object, without it, pasted
+        object.ply  background.ply                  trained Gaussians, the object at its place in the background
         transforms.json  placement.json             cameras of the views; pose of the object in the background
     data_3d/synthetic/scenes/{objects,backgrounds}/NAME     captures
-    data_rotation/SCENE/POSE/                       as a SCENE above; poses in the order of their names
+    data_rotation/SCENE/POSE/                       files of a SCENE; the poses' names sort in their order
     results_3d/{synthetic,real}/METHOD/SCENE/VIEW.png       the authors' pictures
     results_rotation/METHOD/SCENE/POSE/VIEW.png
 """
@@ -23,15 +24,12 @@ import torch
 from splatgraft.core.images import IMAGE_SUFFIXES
 from splatgraft.core.posed_images import held_out
 from splatgraft.project.layout import PLACEMENT_FILE
-from splatgraft.runtime.hub import REPOSITORIES
 from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY
 from splatgraft_paper.tables.paper_numbers import published_name
 
 Kind = Literal["synthetic", "real", "rotation"]
-REPOSITORY = REPOSITORIES["dot3d"]
-"""On Hugging Face, CC-BY 4.0."""
 _PARTS = ("data_3d", "data_rotation", "results_3d", "results_rotation")
-_PICTURES = {"truth": "gt", "masks": "masks", "background": "background", "composite": "composite"}
+_PICTURES = {"truth": "gt", "background": "background", "composite": "composite"}
 _FILES = {
     "object_scene": "object.ply",
     "target_scene": "background.ply",
@@ -42,36 +40,18 @@ _FILES = {
 
 @dataclass(frozen=True)
 class PaperScene:
-    """The folders and files of one scene that are there."""
+    """Existing folders and files of one scene."""
 
     name: str
     kind: Kind
     pose: str = ""
     """P0, P1 or P2 in the rotation experiment."""
     folders: Mapping[str, Path] = field(default_factory=dict)
-    """Pictures: truth, composite, background, masks."""
+    """Folders of pictures by role: truth, composite, background."""
     files: Mapping[str, Path] = field(default_factory=dict)
-    """target_scene, object_scene (trained .ply, the object where it is to stand), cameras, placement, source_capture,
-    target_capture."""
+    """Files by role: target_scene, object_scene (trained .ply), cameras, placement, source_capture, target_capture."""
     results: Mapping[str, Path] = field(default_factory=dict)
-    """The authors' pictures: method to folder."""
-
-
-def download(folder: Path) -> None:
-    """Download the data set from Hugging Face into `folder`; existing files are kept."""
-    import huggingface_hub
-
-    # the card draws the folders in dot3d_data/, the file list may have them at the top
-    patterns = [f"{above}{part}/**" for part in _PARTS for above in ("", "*/")]
-    try:
-        huggingface_hub.snapshot_download(
-            REPOSITORY, repo_type="dataset", local_dir=str(folder), allow_patterns=patterns
-        )
-    except (OSError, ValueError, huggingface_hub.errors.HfHubHTTPError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(
-            f"https://huggingface.co/datasets/{REPOSITORY}: expected to fetch it, found {reason}"
-        ) from error
+    """Folders of the authors' pictures by method."""
 
 
 def find_scenes(folder: Path) -> tuple[PaperScene, ...]:
@@ -108,7 +88,7 @@ def _scene(root: Path, kind: Kind, name: str, folder: Path, results: Path, pose:
 
 
 def pictures(folder: Path) -> dict[str, Path]:
-    """Pictures directly in `folder` by the stem of their name, numbers in their order."""
+    """List the pictures directly in `folder` by the stem of their name, in numerical order."""
     names = [path.name for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES] if folder.is_dir() else []
     if not names:
         raise ValueError(f"{folder}: expected pictures, found {'none' if folder.is_dir() else 'no such folder'}")
@@ -116,16 +96,16 @@ def pictures(folder: Path) -> dict[str, Path]:
 
 
 def held_out_stems(stems: Sequence[str]) -> list[str]:
-    """Every 8th view from the first, in the order of the names (as Mip-NeRF 360 and 3DGS hold out)."""
+    """Select every 8th view from the first, in the order of the names, as Mip-NeRF 360 and 3DGS hold out."""
     chosen = torch.nonzero(held_out(len(stems), HELD_OUT_EVERY)).flatten().tolist()
     return [stems[int(index)] for index in chosen]
 
 
 def match_views(wanted: Sequence[str], found: dict[str, Path]) -> tuple[dict[str, Path], str]:
-    """The views that a method has pictures of, and how they were matched.
+    """Match a method's pictures to views, and describe how.
 
-    By name; or, as 3DGS's render.py numbers its pictures, by order where there are as many as views or as held-out
-    views. Empty where neither fits.
+    Pictures are matched by name, or by order if they are numbered, as by 3DGS's render.py, and their number is that of
+    all views or of the held-out views. The result is empty if neither fits.
     """
     if same := {stem: found[stem] for stem in wanted if stem in found}:
         return same, f"{len(same)} of {len(wanted)} views by name"

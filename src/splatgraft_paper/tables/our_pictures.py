@@ -1,7 +1,7 @@
-"""Our methods on a scene of the data set: pictures of its held-out views, from placed scenes or from captures.
+"""Our methods on a scene of the data set: renders of its held-out views.
 
-An object that is already placed (a trained .ply beside that of the scene) needs no placement of ours; from raw captures
-both are reconstructed and the object is put where placement.json says.
+If both scenes are given as trained .ply files, the object has its place already. Otherwise both captures are
+reconstructed and placement.json places the object.
 """
 
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ from splatgraft_paper.tables.layout import PaperScene, held_out_stems
 
 @dataclass(frozen=True)
 class OurRun:
-    """How our methods are run."""
+    """Settings of our methods."""
 
     out: Path
     """Folder of all results."""
@@ -38,18 +38,18 @@ class OurRun:
 
     @property
     def device(self) -> Device:
-        """Where to compute."""
+        """Device of all steps."""
         return self.methods.device
 
 
 @dataclass(frozen=True)
 class RenderPictures:
-    """Render a scene from some of its cameras."""
+    """Renders of a scene from some of its cameras."""
 
     scene: Path
-    """A .ply."""
+    """Scene, a .ply."""
     cameras: Path
-    """A capture folder or its file."""
+    """Folder of a capture, or its file of cameras."""
     out: Path
     """Folder for VIEW.png."""
     stems: tuple[str, ...] = ()
@@ -57,11 +57,11 @@ class RenderPictures:
     device: Device = "auto"
 
     def inputs(self) -> Inputs:
-        """The scene and the cameras."""
+        """List the scene and the files of cameras."""
         return {"scene": (self.scene,), "cameras": camera_files(self.cameras)}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make the pictures."""
+        """Render the pictures."""
         device = choose_device(self.device, context.console)
         scene, cameras = read_gaussians(self.scene).to(device), read_cameras(self.cameras)
         wanted = [index for index, name in enumerate(cameras.names) if Path(name).stem in self.stems]
@@ -72,7 +72,7 @@ class RenderPictures:
 
 
 def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Console) -> tuple[Path, dict[str, float]]:
-    """Run a method on a scene as far as it is stale; gives the folder of its held-out views, and seconds by step."""
+    """Run a method's stale steps on a scene, and return the folder of its held-out views and seconds by step."""
     work = run.out / "scenes" / scene.name
     cameras_from = _cameras_path(scene)
     composed = _composed(scene, work, run, console)
@@ -106,7 +106,7 @@ def _composed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> C
 
 
 def _placed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> ComposedScene:
-    """Take over an object that already stands where it belongs: the placement is the identity."""
+    """Compose trained scenes; the object has its place already, so the placement is the identity."""
     cameras = read_cameras(_cameras_path(scene))
     composed = ComposedScene(scene.name, work, from_capture=False)
     object_file = work / "object" / OBJECT_FILE
@@ -125,6 +125,6 @@ def _placed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> Com
 
 
 def _without_held_out(cameras: Cameras) -> Cameras:
-    """The cameras whose views are not held out."""
+    """Select the cameras whose views are not held out."""
     held = set(held_out_stems([Path(name).stem for name in cameras.names]))
     return cameras[torch.tensor([Path(name).stem not in held for name in cameras.names])]

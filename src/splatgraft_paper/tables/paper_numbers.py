@@ -1,4 +1,4 @@
-"""The numbers of the paper's tables, transcribed from its source: what ours are put beside."""
+"""Numbers of the paper's tables, transcribed from its source, for comparison with ours."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,16 +11,16 @@ class PublishedTable:
     """One table of the paper."""
 
     key: str
-    """Short name, e.g. "synthetic"."""
+    """Short name, such as "synthetic"."""
     title: str
-    """What it shows, and where it stands in the paper."""
+    """Title with the table's number in the paper."""
     columns: tuple[str, ...]
     """Metrics in the order of the table."""
     rows: Mapping[str, tuple[float, ...]]
-    """The paper's name of a row to its numbers."""
+    """Numbers by the paper's name of the row."""
 
     def value(self, row: str, column: str) -> float | None:
-        """A published number, or None where the table has none."""
+        """Return a published number, or None if the table has none."""
         numbers = self.rows.get(row)
         return None if numbers is None or column not in self.columns else numbers[self.columns.index(column)]
 
@@ -90,11 +90,11 @@ SCENES = {
     "real": 7,
     "rotation": 9,
 }
-"""Scenes of each kind in the published data set; a rotation counts as a scene."""
+"""Number of scenes of each kind in the published data set; a rotation counts as a scene."""
 
 
 def published_name(method: str) -> str:
-    """The paper's name of a method by the name of its folder; that name itself where it is none of the paper's."""
+    """Look up the paper's name of a method by the name of its folder; other names are returned unchanged."""
     plain = "".join(letter for letter in method.lower() if letter.isalnum())
     return _NAMES.get(plain, method)
 

@@ -1,4 +1,4 @@
-"""The paper's tables with its numbers beside those measured here, and its figures: as Markdown, JSON and a page."""
+"""The paper's tables and figures with published and measured numbers, as Markdown, JSON and a page."""
 
 import json
 import shlex
@@ -23,20 +23,19 @@ from splatgraft_paper.tables.run import METRIC_VERSIONS, PaperResults
 
 _FORMATS = {"psnr": "{:.2f}", "fid": "{:.2f}", "minutes": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
 _LESS_IS_BETTER = ("lpips", "fid", "kid", "flip", "minutes")
-_KEYS = {"psnr": "psnr_whole", "ssim": "ssim_padded_whole", "lpips": "lpips_whole", "flip": "flip_whole"}
 _COLUMNS = ("psnr", "ssim", "lpips", "fid", "kid", "flip")
-_EMPTY = "–"  # A cell without a number; the notes say why
+_EMPTY = "–"  # cell without a number; the notes give the reason
 _FIGURES: dict[Kind, tuple[str, ...]] = {
     "synthetic": ("composite", "GS-IR", "GShader", "3DGS-DR", "Ours", "truth"),
     "real": ("background", "composite", "GS-IR", "GShader", "3DGS-DR", "Ours"),
     "rotation": ("composite", "Ours", "truth"),
 }
-"""Columns of the paper's figures of 3D results; our methods come before the last."""
-_ROW_HEIGHT = 200  # pixels of a picture in a figure
+"""Columns of the paper's figures of 3D results; our methods are inserted before the last."""
+_ROW_HEIGHT = 200  # height of a picture in a figure, pixels
 
 
 def write_paper_report(out: Path, results: PaperResults) -> Path:
-    """Write index.html, paper.md, paper.json and figures/; returns the page."""
+    """Write index.html, paper.md, paper.json and figures/, and return the page."""
     tables, notes, figures = paper_tables(results), protocol_notes(results), _figures(out, results)
     shown = [f"![{path.stem}]({path.relative_to(out).as_posix()})" for path in figures]
     text = [*(table.markdown() for table in tables), *shown, "\n".join(f"- {note}" for note in notes)]
@@ -56,7 +55,7 @@ def write_paper_report(out: Path, results: PaperResults) -> Path:
 
 
 def paper_tables(results: PaperResults) -> list[Table]:
-    """The paper's four tables, its ablation of the loss, its costs, and PSNR by scene."""
+    """Make the paper's four tables, its ablation of the loss, its costs, and PSNR by scene."""
 
     def title(metric: str) -> str:
         return f"{_metric(metric, results)} {'↓' if metric in _LESS_IS_BETTER else '↑'}"
@@ -99,7 +98,7 @@ def paper_tables(results: PaperResults) -> list[Table]:
         scenes = [scene.name for scene in results.scenes if scene.kind == kind]
         rows = []
         for name in results.methods(kind):
-            values = {item.scene.name: item.values.get("psnr_whole") for item in results.of(kind, name)}
+            values = {item.scene.name: item.values.get("psnr") for item in results.of(kind, name)}
             rows.append((name, *(_text("psnr", values.get(scene)) for scene in scenes)))
         if rows:
             tables.append(Table(f"PSNR by scene: {kind}", ("method", *scenes), tuple(rows)))
@@ -114,7 +113,7 @@ _COST_STEPS = {
     "consolidate, LPIPS": ("consolidate", "/paper"),
     "consolidate, L1 and SSIM": ("consolidate", "/paper-l1-dssim"),
 }
-"""Row of the costs to the step whose record has it, and how the name of its method ends."""
+"""Recorded step and ending of the method's name, by row of the costs."""
 
 
 def _data_rows(results: PaperResults) -> tuple[tuple[str, ...], ...]:
@@ -139,31 +138,29 @@ def _cost_rows(results: PaperResults) -> tuple[tuple[str, ...], ...]:
 
 
 def _step_minutes(results: PaperResults, method: str, step: str) -> str:
-    """Mean time of one step of a method over the synthetic scenes on which it ran."""
+    """Average the time of one step of a method over the synthetic scenes on which it ran."""
     spent = [item.seconds[step] for item in results.of("synthetic", method) if step in item.seconds]
     return _text("minutes", sum(spent) / len(spent) / 60 if spent else None)
 
 
 def protocol_notes(results: PaperResults) -> list[str]:
-    """What a reader needs to know to compare the numbers, one sentence each."""
+    """List the conditions of the measurement, one sentence each."""
     measured = results.measured
     kinds = {kind: sum(scene.kind == kind for scene in results.scenes) for kind in SCENES}
     found = ", ".join(f"{count} of {SCENES[kind]} {kind}" for kind, count in kinds.items())
     resolutions = sorted({str(size) for item in measured for size in item.protocol.get("resolution", ())})  # pyright: ignore
     views = sorted({str(item.protocol["views"]) for item in measured})
-    masked = sum(bool(item.protocol.get("masks")) for item in measured)
     notes = [
         f"Scenes of the published data set found: {found}.",
-        f"Views: {'; '.join(views) or 'none'} (the paper says so of the rotation experiment, not of the others).",
-        f"Resolution: {', '.join(resolutions) or 'none'}, as the pictures are; nothing is resampled or cropped. Values "
+        f"Views: {'; '.join(views) or 'none'} (the paper states this for the rotation experiment alone).",
+        f"Resolution: {', '.join(resolutions) or 'none'}, that of the pictures, without resampling or cropping. Values "
         "are read as 8-bit sRGB in [0, 1] and not clamped further; renders of ours are clamped to [0, 1].",
-        f"Masks: {masked} of {len(measured)} measurements have masks; metrics of regions need them.",
         "Brackets: 95% bootstrap interval of the mean over scenes (10,000 resamples); one scene has none.",
         *(f"{name.upper()}: {text}." for name, text in METRIC_VERSIONS.items()),
         *(f"Not measured: {name}: {reason}" for name, reason in results.not_measured.items()),
         *(f"{scene}, {method}: {reason}" for (scene, method), reason in results.missing.items()),
         *(
-            f"{name.upper()}: the weights are not the published ones; its columns are a stand-in's."
+            f"{name.upper()}: the weights are not the published ones, so its columns show a stand-in."
             for name in sorted(results.stand_ins)
         ),
         f"Made by splatgraft {version('splatgraft')} at commit {source_commit()}: "
@@ -177,7 +174,7 @@ def _named(method: str, results: PaperResults) -> str:
 
 
 def _metric(name: str, results: PaperResults) -> str:
-    """The name of a metric in a head; of one whose weights are not the published ones, that of its stand-in."""
+    """Return the title of a metric; it says if the weights are not the published ones."""
     if name == "minutes":
         return name
     return f"stand-in for {name.upper()}" if name in results.stand_ins else name.upper()
@@ -188,13 +185,13 @@ def _published(table: PublishedTable, row: str, columns: Sequence[str]) -> list[
 
 
 def _measured(results: PaperResults, kind: Kind, method: str, pose: str = "") -> list[str]:
-    found = [item for item in results.of(kind, method, pose) if "psnr_whole" in item.values]
+    found = results.of(kind, method, pose)
     cells: list[str] = []
     for column in _COLUMNS:
         if column in ("fid", "kid"):
             cells.append(_text(column, results.pooled.get((kind, pose, method), {}).get(column)))
             continue
-        summary = summarize([item.values.get(_KEYS[column]) for item in found])
+        summary = summarize([item.values.get(column) for item in found])
         cells.append(_text(column, None if summary is None else summary.mean))
         if summary is not None and summary.scenes > 1:
             cells[-1] += f" [{_text(column, summary.low)}, {_text(column, summary.high)}]"
@@ -239,7 +236,7 @@ def _as_json(results: PaperResults, notes: Sequence[str]) -> dict[str, object]:
 
 
 def _figures(out: Path, results: PaperResults) -> list[Path]:
-    """One sheet of pictures for each kind of scene, as the paper's figures of 3D results."""
+    """Write one sheet of pictures for each kind of scene, like the paper's figures of 3D results."""
     found: list[Path] = []
     for kind, columns in _FIGURES.items():
         wanted = (*columns[:-1], *results.ours, columns[-1])
@@ -255,7 +252,7 @@ def _figures(out: Path, results: PaperResults) -> list[Path]:
 
 
 def _figure_row(out: Path, scene: PaperScene, columns: Sequence[str]) -> Float[Tensor, "h w 3"] | None:
-    """The middle held-out view of a scene by each column that has a picture of it."""
+    """Make a row of a scene's middle held-out view, from the columns that have a picture of it."""
     ours = {name: out / "scenes" / scene.name / "pictures" / name.replace("/", "-") for name in columns}
     folders = {name: path for name, path in ours.items() if path.is_dir()} | dict(scene.results) | dict(scene.folders)
     reference = folders.get("truth") or folders.get("composite")

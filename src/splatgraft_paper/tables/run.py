@@ -1,4 +1,4 @@
-"""One run on the authors' data set: their pictures are measured, our methods run, and what is missing is explained."""
+"""One run on the authors' data set: measures their pictures, runs our methods, and explains what is missing."""
 
 import json
 from collections.abc import Mapping
@@ -27,15 +27,14 @@ from splatgraft_paper.tables.our_pictures import OurRun, our_pictures
 
 METRIC_VERSIONS = {
     "psnr": "whole images, peak 1, mean over views, then over scenes",
-    "ssim": "Wang 2004, 11x11 Gaussian window, zeros beyond the border, as 3DGS's metrics.py (ssim_whole in the JSON: "
-    "valid pixels only)",
+    "ssim": "Wang 2004, 11x11 Gaussian window, zeros beyond the border, as 3DGS's metrics.py",
     "flip": FLIP_VERSION,
     "lpips": f"Zhang 2018, version 0.1, VGG-16 ({VGG_FILE}, {HEADS_FILE}), pictures scaled to [-1, 1] as published "
     "(3DGS's metrics.py gives the network [0, 1]; which of the two the paper used is not said)",
     "fid": f"Heusel 2017, pooled over the measured views of all scenes, {INCEPTION_FILE}",
     "kid": f"Binkowski 2018, likewise, subsets of 50, {INCEPTION_FILE}",
 }
-"""What each metric was computed with; the paper does not say how it computed its own."""
+"""Definition of each metric; the paper does not give its own definitions."""
 
 
 @dataclass(frozen=True)
@@ -44,41 +43,41 @@ class Measured:
 
     scene: PaperScene
     method: str
-    values: Mapping[str, float | None]
-    """Metric to its mean over the measured views."""
+    values: Mapping[str, float]
+    """Mean over the measured views by metric."""
     protocol: Mapping[str, object]
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """Seconds by step, of methods that were run here."""
+    """Seconds by step, for methods run here."""
 
 
 @dataclass(frozen=True)
 class PaperResults:
-    """Everything that a run found."""
+    """All results of a run."""
 
     scenes: tuple[PaperScene, ...]
     measured: tuple[Measured, ...]
     missing: Mapping[tuple[str, str], str]
-    """(scene, method) to the reason why there is no measurement."""
+    """Reasons for missing measurements by (scene, method)."""
     not_measured: Mapping[str, str]
-    """Metrics without weights ("lpips", "fid and kid") to the reason."""
+    """Reasons for missing weights by metric ("lpips", "fid and kid")."""
     ours: tuple[str, ...] = ()
-    """Names of the methods of this software, in order."""
+    """Names of our methods, in order."""
     pooled: Mapping[tuple[Kind, str, str], Mapping[str, float]] = field(default_factory=dict)
-    """(kind, pose or "", method) to FID and KID."""
+    """FID and KID by (kind, pose or "", method)."""
     by_model: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Name of a trained model to its metrics on each source's test split, such as `psnr Blender`."""
+    """Metrics on each source's test split, such as `psnr Blender`, by trained model."""
     stand_ins: frozenset[str] = frozenset()
     """Metrics whose weights are not the published ones."""
     device: str = ""
-    """What the methods ran on."""
+    """Name of the device on which our methods ran."""
 
     def methods(self, kind: Kind) -> list[str]:
-        """Methods with pictures of scenes of a kind: the authors' first, then ours."""
+        """List the methods with pictures of scenes of a kind, the authors' first."""
         found = [m for scene in self.scenes if scene.kind == kind for m in scene.results]
         return list(dict.fromkeys([*found, *self.ours]))
 
     def of(self, kind: Kind, method: str, pose: str = "") -> list[Measured]:
-        """The measurements of a method on the scenes of a kind, at one pose where one is given."""
+        """Select the measurements of a method on the scenes of a kind, optionally at one pose."""
         chosen = [item for item in self.measured if item.scene.kind == kind and item.method == method]
         return [item for item in chosen if pose in ("", item.scene.pose)]
 
@@ -86,12 +85,11 @@ class PaperResults:
 def pooled_distances(
     steps: Mapping[tuple[Kind, str, str], list[MeasurePictures]], features: Features
 ) -> dict[tuple[Kind, str, str], dict[str, float]]:
-    """FID and KID of a method's pictures of all its scenes against the truth's."""
+    """Compute FID and KID between a method's pictures of all its scenes and the true pictures."""
     out: dict[tuple[Kind, str, str], dict[str, float]] = {}
     for key, group in steps.items():
-        chosen = [views for step in group if "truth" in (views := step.views()).files]
-        paths = {role: [views.files[role][stem] for views in chosen for stem in views.matched]
-                 for role in ("pictures", "truth")}  # fmt: skip
+        chosen = [step.views().files for step in group]
+        paths = {role: [path for files in chosen for path in files[role].values()] for role in ("pictures", "truth")}
         if len(paths["truth"]) >= 2:
             found, wanted = (np.concatenate([features([read_rgb(path)]) for path in one]) for one in paths.values())
             out[key] = {"fid": frechet_distance(found, wanted), "kid": kernel_distance(found, wanted)}
@@ -99,26 +97,26 @@ def pooled_distances(
 
 
 COMPOSITE = "Composite"
-"""The row of the pictures before any harmonisation."""
+"""Row of the pictures before any harmonisation."""
 
 
 @dataclass(frozen=True)
 class PaperRun:
-    """What is run and measured."""
+    """Scenes and methods of one run."""
 
     ours: OurRun
-    """How our methods are run, and where all results go."""
+    """Settings of our methods, with the folder of all results."""
     scenes: tuple[PaperScene, ...]
     methods: tuple[Method, ...]
     measure_only: bool = False
-    """Measure the pictures that are there, and run nothing."""
+    """Whether to measure existing pictures and run no method."""
     all_views: bool = False
-    """Measure all views, not only the held-out ones."""
+    """Whether to measure all views instead of the held-out ones."""
 
 
 @dataclass
 class _Found:
-    """What has been measured so far, and how."""
+    """Results so far of a running run."""
 
     lpips: bool
     console: Console
@@ -128,7 +126,7 @@ class _Found:
 
 
 def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: Console) -> PaperResults:
-    """Measure and run what is missing; the models of the data ablation are measured apart."""
+    """Measure and run what is missing, except for the models of the data ablation."""
     found = _Found("lpips" not in not_measured, console)
     for scene in run.scenes:
         composite = scene.folders.get("composite")
@@ -151,7 +149,7 @@ def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: C
 
 
 def _run_ours(run: PaperRun, scene: PaperScene, method: Method, found: _Found) -> None:
-    """Run a method on a scene and measure it; a method that cannot run leaves its reason."""
+    """Run a method on a scene and measure it; record the reason if it cannot run."""
     try:
         folder, seconds = our_pictures(scene, method, run.ours, found.console)
         _measure(run, scene, method.name, folder, found, seconds)
@@ -162,12 +160,14 @@ def _run_ours(run: PaperRun, scene: PaperScene, method: Method, found: _Found) -
 def _measure(
     run: PaperRun, scene: PaperScene, method: str, folder: Path, found: _Found, seconds: Mapping[str, float] = {}
 ) -> None:
+    """Measure pictures of a scene whose truth is known."""
+    if "truth" not in scene.folders:
+        return
     out = run.ours.out / "measured" / scene.name / method.replace("/", "-")
-    weights = run.ours.methods.weights
-    step = MeasurePictures(folder, out, **scene.folders, weights=weights, lpips=found.lpips, all_views=run.all_views)
+    truth, weights = scene.folders["truth"], run.ours.methods.weights
+    step = MeasurePictures(folder, truth, out, weights, found.lpips, run.all_views)
     perform_if_stale(step, found.console)
     record = json.loads((out / METRICS_FILE).read_text())
     found.measured.append(Measured(scene, method, record["values"], record["protocol"], seconds))
-    if "truth" in scene.folders:
-        for pose in {"", scene.pose}:
-            found.pools.setdefault((scene.kind, pose, method), []).append(step)
+    for pose in {"", scene.pose}:
+        found.pools.setdefault((scene.kind, pose, method), []).append(step)

@@ -1,4 +1,4 @@
-"""Training of FLUX as a harmoniser: rectified flow matching on the velocity (paper, Sec. 5, Eq. 1)."""
+"""Training of FLUX as a harmoniser by rectified flow matching on the velocity (paper, Sec. 5, Eq. 1)."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -28,18 +28,18 @@ from splatgraft.runtime.files import atomic_write
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, Objective, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, TrainingData, crop_pair_to_size, open_training_data
-from splatgraft_paper.training.recipes import Recipe, TrainingCost, say_plan
+from splatgraft_paper.training.recipes import Recipe, say_plan
 from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 
 Times = Literal["uniform", "schnell"]
 TINY = "tiny"
-"""In place of a base model: one of three million weights is made first, in OUT/base."""
-_BASE_PICTURES = 1200  # most pictures that the tiny base model's autoencoder is trained on
+"""Name that stands for a base model of three million weights, which is made first, in OUT/base."""
+_BASE_PICTURES = 1200  # maximum number of pictures for training the tiny base model's autoencoder
+# attention and feed-forward layers of all blocks
 _LORA_TARGETS = (
     r"(single_)?transformer_blocks\..*"
     r"\.(to_[qkv]|to_out\.0|add_[qkv]_proj|to_add_out|proj_mlp|proj_out|ff(_context)?\.net\.(0\.proj|2))"
 )
-"""Attention and feed-forward layers of all blocks."""
 
 
 @dataclass(frozen=True)
@@ -47,23 +47,23 @@ class FluxTrainingOptions:
     """Options of the training of the FLUX harmoniser (paper, Sec. 5)."""
 
     base: str = "flux"
-    """Folder or hub id with transformer/ and vae/ (a harmoniser's to go on); `tiny` makes a small one in OUT/base."""
+    """Folder or hub id with transformer/ and vae/, also of a harmoniser; `tiny` makes a small one in OUT/base."""
     data: DataOptions = field(default_factory=DataOptions)
     loop: LoopOptions = field(default_factory=LoopOptions)
     condition: Variant = "image-mask"
-    """The network's input beside the composite: the object's mask (the paper) or the scene without the object."""
+    """Input of the network beside the composite: the object's mask (the paper) or the scene without the object."""
     first_layer: FirstLayer = "repeat"
-    """How the first layer is widened: by its own weights (the paper) or by zeros."""
+    """Initial weights of the wider first layer: repeated (the paper) or zeros."""
     lora: int = 0
     """Rank of a low-rank adaptation; 0 trains all weights."""
     times: Times = "uniform"
-    """Noise levels that are trained: all alike, or the four that inference uses."""
+    """Noise levels of the training: uniform, or the four of inference."""
     no_checkpointing: bool = False
-    """Keep activations instead of computing them twice: faster, several times the memory."""
+    """Keep activations instead of computing them twice; faster, but needs several times the memory."""
     recipe: str | None = None
-    """paper, without-blender, without-flux, without-orida, tiny or a .toml file: options where you give none."""
+    """Default options: paper, without-blender, without-flux, without-orida, tiny or a .toml file."""
     plan: bool = False
-    """Only print what would run: steps, hours, memory per device, disk, licences."""
+    """Print the plan without training: steps, GPUs, data, licences."""
 
 
 class FluxObjective(Objective):
@@ -104,7 +104,7 @@ class FluxObjective(Objective):
         self.prompt = self.prompt.to(torch.device(device), torch.float32)
 
     def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
-        """Mean of || v(z_t, z_comp, z_mask, c, t) - (eps - z_0) ||^2 (paper, Eq. 1)."""
+        """Compute the mean of || v(z_t, z_comp, z_mask, c, t) - (eps - z_0) ||^2 (paper, Eq. 1)."""
         clean = latents["target"]
         levels, eps = [], []
         for seed in seeds:
@@ -116,7 +116,7 @@ class FluxObjective(Objective):
         return ((velocity(network, joined, level, self.prompt).float() - (drawn - clean)) ** 2).mean()
 
     def predict(self, network: Network, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
-        """Harmonise by schnell's four steps."""
+        """Harmonise with schnell's four steps."""
         conditions = self._conditions(latents)
         b, device = conditions.shape[0], conditions.device
         size = tuple(latents["composite"].shape[1:])
@@ -145,9 +145,9 @@ class FluxObjective(Objective):
 
 
 def add_lora(network: Any, rank: int, *, seed: int) -> int:
-    """Freeze `network` and add trainable low-rank matrices to its linear layers, in place, by PEFT; gives their number.
+    """Freeze `network`, add trainable low-rank matrices to its linear layers in place (PEFT), and return their number.
 
-    All weights of the first layer stay trainable, since it is new where it was widened.
+    All weights of the first layer stay trainable, because it may have been widened.
     """
     from peft import LoraConfig
 
@@ -163,7 +163,7 @@ def add_lora(network: Any, rank: int, *, seed: int) -> int:
 
 
 def write_lora(path: Path, state: dict[str, Tensor], about: dict[str, str]) -> None:
-    """Write the low-rank matrices under diffusers' names, and the whole first layer."""
+    """Write the low-rank matrices and the whole first layer under diffusers' names."""
     named = {f"transformer.{name.replace('.default.', '.')}": tensor for name, tensor in state.items()}
     write_tensors(path, {name: one for name, one in named.items() if ".lora_" in name or ".x_embedder." in name}, about)
 
@@ -176,11 +176,11 @@ def _level(times: Times, generator: torch.Generator) -> Float[Tensor, ""]:
 
 
 def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Path | None:
-    """Train a harmoniser; gives its folder in the first process, None in others and where only the plan is printed."""
+    """Train a harmoniser and return its folder; None in all but the first process, or if only the plan is printed."""
     recipe = Recipe.read(options.recipe) if options.recipe else None
     processes = join_processes(options.loop)
     if options.plan or recipe:
-        say_plan(recipe, _cost(options, _known_config(options.base)), processes, console)
+        say_plan(recipe, options.loop, options.data.size, processes, console)
         if options.plan:
             return None
     data = open_training_data(options.data, options.loop.seed, recipe)
@@ -195,7 +195,7 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
 
 
 def _make_tiny_base(folder: Path, data: TrainingData, seed: int, console: Console) -> None:
-    """Make the tiny base model from training pictures."""
+    """Make the tiny base model; training pictures train its autoencoder."""
     pictures = []
     for files in data.mixture.all()[: _BASE_PICTURES // 3]:
         pair = crop_pair_to_size(files.read(), data.width, data.height)
@@ -203,21 +203,3 @@ def _make_tiny_base(folder: Path, data: TrainingData, seed: int, console: Consol
     folder.parent.mkdir(parents=True, exist_ok=True)
     with console.bar("autoencoder") as progress, locked(folder.parent):
         write_tiny_base(folder, pictures, TinyBaseOptions(seed=seed), say=console.say, progress=progress)
-
-
-def _known_config(base: str) -> dict[str, Any]:
-    """The transformer's config, or nothing where FLUX.1-schnell's holds: a plan fetches no weights."""
-    if base == TINY:
-        tiny = TinyBaseOptions()
-        heads = {"num_attention_heads": tiny.heads, "attention_head_dim": tiny.head_width}
-        return {**heads, "num_layers": tiny.double_blocks, "num_single_layers": tiny.single_blocks}
-    return FluxFolder.open(Path(base)).config if Path(base).is_dir() else {}
-
-
-def _cost(options: FluxTrainingOptions, config: dict[str, Any]) -> TrainingCost:
-    width = config.get("num_attention_heads", 24) * config.get("attention_head_dim", 128)
-    doubles, singles = config.get("num_layers", 19), config.get("num_single_layers", 38)
-    # with the modulations that inference bakes: 6 a stream of a double block, 3 a single one
-    parameters = width**2 * (36 * doubles + 15 * singles)
-    trained = options.lora * width * (36 * doubles + 20 * singles) if options.lora else parameters
-    return TrainingCost(options.loop, options.data.size, parameters, trained)

@@ -1,4 +1,4 @@
-"""Samples of relit images: of prompts by FLUX.1-schnell, and of ORIDa's photographs (paper, Sec. 5.2 and 5.3).
+"""Samples of relit images, painted by FLUX.1-schnell or chosen from ORIDa's photos (paper, Sec. 5.2 and 5.3).
 
 Finished samples are kept, unsuitable ones are recorded. Untested with FLUX's real weights and ORIDa's archive.
 """
@@ -36,46 +36,45 @@ from splatgraft_paper.training.relighters import DiffusionRenderer, StandInRelig
 
 SHEET_FILE = "sheet.png"
 _REJECTED = "rejected"
-_MIN_COVERED, _MAX_COVERED = 0.01, 0.6
-"""Share of the image that an object may cover; set by hand."""
+_MIN_COVERED, _MAX_COVERED = 0.01, 0.6  # limits of the share of the image that an object covers, set by hand
 
 
 @dataclass(frozen=True)
 class SamplePlan:
-    """One sample to be generated."""
+    """One sample to generate."""
 
     name: str
     """Name of the sample's folder."""
     group: str
-    """Samples of one group are held out together."""
+    """Group of samples that are held out together."""
     make: Callable[[], RelitSample]
-    """The sample before it is relit."""
+    """Function that returns the sample before relighting."""
     record: Mapping[str, Any]
     """Provenance: prompt, seed, models, licence."""
 
 
 @dataclass(frozen=True)
 class Lighting:
-    """The relighter and the environment maps of the samples."""
+    """Relighter and environment maps of the samples."""
 
     relighter: DiffusionRenderer | StandInRelighter
     maps: Sequence[Path]
     """Environment maps to choose from."""
     each: int
-    """Lights per sample."""
+    """Number of lights per sample."""
     seed: int
 
     def choose(self, name: str) -> list[Path]:
-        """Choose the maps of a sample, determined by its name and the seed."""
+        """Choose the maps of a sample; its name and the seed determine them."""
         return random.Random(f"lights-{self.seed}-{name}").sample(list(self.maps), min(self.each, len(self.maps)))
 
 
 def generate(
     out: Path, plans: Iterable[SamplePlan], lighting: Lighting, *, total: int, progress: Progress = silent
 ) -> int:
-    """Generate samples up to `total`, then write the manifest and a contact sheet; gives the number of samples.
+    """Generate samples up to `total`, write the manifest and a contact sheet, and return the number of samples.
 
-    A sample whose object is too small, too large or not found is recorded in rejected/ and not tried again.
+    A sample is recorded in rejected/ and not tried again if its object is too small, too large or not found.
     """
     (out / _REJECTED).mkdir(parents=True, exist_ok=True)
     done = 0
@@ -96,7 +95,7 @@ def generate(
 
 
 def contact_sheet(folder: PairFolder, *, rows: int = 24, width: int = 240) -> Float[Tensor, "h w 3"]:
-    """Show evenly chosen pairs, one per row: target, background, composite."""
+    """Make a sheet of evenly chosen pairs, one per row: target, background, composite."""
     count = len(folder.pairs)
     chosen = [round(i * (count - 1) / max(rows - 1, 1)) for i in range(min(rows, count))]
     lines = []
@@ -110,7 +109,7 @@ def contact_sheet(folder: PairFolder, *, rows: int = 24, width: int = 240) -> Fl
 
 
 def _generate_one(out: Path, plan: SamplePlan, lighting: Lighting) -> int:
-    """Write the sample; 1 where it was written, 0 where it was rejected."""
+    """Generate a sample; return 1 if it was written, 0 if it was rejected."""
     unrelit = plan.make()
     covered = float((unrelit.mask > 0.5).float().mean())
     if not _MIN_COVERED <= covered <= _MAX_COVERED:
@@ -133,21 +132,21 @@ def _generate_one(out: Path, plan: SamplePlan, lighting: Lighting) -> int:
 
 @dataclass(frozen=True)
 class RelightingOptions:
-    """The relighter and its environment maps."""
+    """Relighter and environment maps."""
 
     lights: Path = Path("lights")
     """Folder with .hdr environment maps."""
     each: int = 4
-    """Lights per image."""
+    """Number of lights per image."""
     relighter: Literal["diffusion-renderer", "stand-in"] = "diffusion-renderer"
-    """The paper's DiffusionRenderer, in your own installation; or a simple stand-in without a learned model."""
+    """Relighter: the paper's DiffusionRenderer in your own installation, or a stand-in without a learned model."""
     renderer: Path | None = None
     """Folder of DiffusionRenderer's code."""
     renderer_python: Path | None = None
-    """The Python that runs it; the current one where not given."""
+    """Python that runs DiffusionRenderer; default: the current one."""
 
     def open(self, seed: int) -> Lighting:
-        """Prepare the relighter and list the maps; `seed` determines the choice of maps."""
+        """Prepare the relighter and list the maps; `seed` determines which maps a sample gets."""
         maps = sorted(self.lights.glob("*.hdr")) if self.lights.is_dir() else []
         if not maps:
             raise ValueError(f"{self.lights}: expected a folder with .hdr environment maps (--lights), found none")
@@ -161,11 +160,11 @@ class RelightingOptions:
         return Lighting(renderer, maps, self.each, seed)
 
 
-_PIPELINE_BYTES = 36 << 30  # GPU memory of bf16 FLUX with both text encoders and its activations. An estimate.
+_PIPELINE_BYTES = 36 << 30  # estimated GPU memory of bf16 FLUX with both text encoders and activations
 
 
 def text_to_image_pipeline(base: str) -> Any:
-    """Load the stock FLUX pipeline with its text encoders in bfloat16; needs transformers too."""
+    """Load the stock FLUX pipeline with its text encoders in bfloat16; needs transformers."""
     try:
         return diffusers_library().FluxPipeline.from_pretrained(hub_id(base), torch_dtype=torch.bfloat16)
     except OSError as error:
@@ -175,13 +174,13 @@ def text_to_image_pipeline(base: str) -> Any:
 def load_painter(
     base: str, device: torch.device, size: tuple[int, int], say: Callable[[str], None]
 ) -> Callable[[str, int], Float[Tensor, "h w 3"]]:
-    """Load what paints a picture of a prompt and a seed, sRGB in [0, 1]; `size` is width and height.
+    """Load FLUX and return a function that paints a prompt with a seed, sRGB in [0, 1]; `size` is width and height.
 
-    Its parts stay on the CPU in turn where GPU memory does not suffice.
+    If GPU memory does not suffice, parts of the pipeline move to the GPU in turn.
     """
     pipeline = text_to_image_pipeline(base)
     if device.type == "cuda" and torch.cuda.mem_get_info(device)[0] < _PIPELINE_BYTES:
-        say("text to image: parts are fetched from the CPU in turn, since GPU memory does not hold all of them")
+        say("text to image: GPU memory is too small for all parts, so they move to the GPU in turn, which is slower")
         pipeline.enable_model_cpu_offload()
     else:
         pipeline.to(device)
@@ -207,7 +206,7 @@ LICENCE = "ORIDa, see its own terms"
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph of an object in a scene."""
+    """One photo of an object in a scene."""
 
     image: Path
     mask: Path
@@ -218,12 +217,12 @@ class Photograph:
 
     @property
     def name(self) -> str:
-        """A unique folder name."""
+        """Unique name of a folder."""
         return f"{self.object}_{self.scene}_{self.image.stem}".replace("/", "-")
 
 
 def read_orida(root: Path) -> list[Photograph]:
-    """List all photographs of an index.csv with the columns image, mask, background (files), object and scene."""
+    """List all photos of an index.csv with the columns image, mask, background (files), object and scene."""
     path, found = root / INDEX_FILE, []
     if not path.is_file():
         raise ValueError(f"{path}: expected a table with the columns {', '.join(COLUMNS)}, found no file")
@@ -241,7 +240,7 @@ def read_orida(root: Path) -> list[Photograph]:
 
 
 def choose_balanced(photographs: list[Photograph], count: int, seed: int) -> list[Photograph]:
-    """Choose `count` photographs, balanced by object and scene; all where there are fewer."""
+    """Choose at most `count` photos, balanced by object and scene."""
     queues: dict[tuple[str, str], list[Photograph]] = defaultdict(list)
     for photograph in photographs:
         queues[photograph.object, photograph.scene].append(photograph)

@@ -1,13 +1,15 @@
-"""The training loop, on one process or several; a killed run resumes bit for bit on as many processes as before.
+"""The training loop, on one or several processes.
 
-The items of a step follow from the seed and the step alone, so a saved state holds weights, optimiser and moving
-average, and the number of processes may change between runs. Processes, gradient exchange, accumulation and clipping
-are accelerate's. Three small parts are ours: weights are split by torch's `fully_shard` (accelerate ignores FSDP on a
-CPU, where it is tested), states are written by torch.distributed.checkpoint (accelerate's hold frozen weights too, 24
-GB a state of a FLUX that is adapted by LoRA), and items are read ahead by threads (a scheduler's SIGTERM kills
-DataLoader's processes before the state is saved).
+Seed and step determine the items of a step, so a state has only weights, optimiser and moving average. A killed run
+resumes bit for bit on the same number of processes; that number may also change between runs.
 
-    STATES/00001000/job.json                 what is trained: options and data that must stay equal
+accelerate starts processes, exchanges and clips gradients, and accumulates passes. Three parts do not use it:
+
+- torch's `fully_shard` splits weights, because accelerate ignores FSDP on a CPU, where the loop is tested.
+- torch.distributed.checkpoint writes states, because accelerate's contain frozen weights, 24 GB for FLUX with LoRA.
+- Threads read items ahead, because a scheduler's SIGTERM kills DataLoader's processes before the state is saved.
+
+    STATES/00001000/job.json                 options and data that must be equal in a resumed run
     STATES/00001000/.metadata, __0_0.distcp  weights, optimiser and moving average, one file per process
 """
 
@@ -49,11 +51,11 @@ from splatgraft.runtime.progress import Progress
 LOG_FILE = "log.jsonl"
 STATES = "states"
 _JOB_FILE = "job.json"
-_KEPT_STATES = 2  # one more than needed, so that a damaged file does not end a training
+_KEPT_STATES = 2  # one is spare, in case a file of the newest is damaged
 _BROKEN_STATE = (CheckpointException, OSError, RuntimeError, ValueError, KeyError, EOFError, pickle.UnpicklingError)
 _STEPS_AHEAD = 4  # steps whose items are read while the network computes
-_SMOOTHING_STEPS = 50  # steps over which the loss that is shown is averaged
-_STOP, _UNREADABLE = 1, 2
+_SMOOTHING_STEPS = 50  # steps over which the displayed loss is averaged
+_STOP, _UNREADABLE = 1, 2  # signals among processes: interrupted, or an item cannot be read
 
 
 @dataclass(frozen=True)
@@ -63,23 +65,23 @@ class LoopOptions:
     steps: int = 50_000
     """Optimiser steps."""
     batch: int = 4
-    """Pairs per optimiser step, over all processes together."""
+    """Pairs per optimiser step, over all processes."""
     accumulate: int = 1
-    """Passes that a process takes per optimiser step, to save memory."""
+    """Passes per process and optimiser step; more need less memory."""
     rate: float = 3e-5
     """Learning rate of Adam."""
     warm_up: int = 0
     """Steps over which the rate rises from zero."""
     clip: float = 1.0
-    """Largest norm of the gradient; 0 does not clip."""
+    """Maximum norm of the gradient; 0 does not clip."""
     ema: float = 0.0
     """Decay of the moving average of the weights, which is then the result; 0 for none."""
     precision: Literal["no", "bf16"] = "bf16"
     """Arithmetic of the network; the optimiser's weights are float32."""
     parallel: Literal["copies", "shards"] = "copies"
-    """Several processes: each has all weights, or a share of weights, gradients and optimiser (FSDP 2)."""
+    """Distribution over processes: each has all weights, or a share of weights, gradients and optimiser (FSDP 2)."""
     save_every: int = 1000
-    """Steps between states from which a killed run goes on."""
+    """Steps between saved states; a killed run resumes from the newest."""
     validate_every: int = 1000
     """Steps between validations."""
     validation_pairs: int = 8
@@ -87,12 +89,12 @@ class LoopOptions:
     seed: int = 0
     """Seed of the order of pairs, the noise and initial values."""
     readers: int = 4
-    """Threads of each process that read pictures and latents ahead."""
+    """Number of threads per process that read pictures and latents ahead."""
     cpu: bool = False
     """Train on the CPU even if a GPU is available."""
 
     def check(self, processes: int) -> int:
-        """Check the options; gives pairs per process and pass."""
+        """Check the options, and return the number of pairs per process and pass."""
         for name in ("steps", "batch", "accumulate", "save_every", "validate_every", "readers"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name.replace('_', '-')}: expected at least 1, found {getattr(self, name)}")
@@ -109,51 +111,51 @@ class LoopOptions:
 
 @dataclass(frozen=True)
 class Validation:
-    """Metrics on pairs for validation."""
+    """Metrics on validation pairs."""
 
     metrics: Mapping[str, float]
     sentence: str
-    """The metrics in one line of text."""
+    """Metrics in one line of text."""
     sheet: Float[Tensor, "h w 3"]
-    """Pictures, a row for each pair, sRGB in [0, 1]."""
+    """Pictures, one row per pair, sRGB in [0, 1]."""
 
 
 @runtime_checkable
 class Task(Protocol):
-    """What is trained: a network, its items and its loss. Reading and validating raise ValueError for broken files."""
+    """A network with its items and its loss. Reading and validating raise ValueError for broken files."""
 
     network: nn.Module
-    """Frozen parameters have requires_grad off."""
+    """Network; requires_grad is off for frozen parameters."""
     fingerprint: Mapping[str, Any]
-    """Data and settings besides `LoopOptions` that must be equal for a state to be resumed; JSON values."""
+    """Data and settings besides `LoopOptions` that must be equal in a resumed run; JSON values."""
 
     def optimizer(self) -> torch.optim.Optimizer:
         """Make the optimiser of the trained parameters."""
         ...
 
     def rate_at(self, step: int) -> float:
-        """Learning rate at a step, counted from 0."""
+        """Return the learning rate at a step, counted from 0."""
         ...
 
     def read(self, position: int) -> Any:
-        """Read the item at a position of the infinite sequence, in a thread."""
+        """Read the item at a position of the infinite sequence; called in a thread."""
         ...
 
     def loss(self, network: Callable[..., Any], items: Sequence[Any]) -> Float[Tensor, ""]:
-        """Compute the mean loss of items; `network` calls `self.network` with what exchanges its gradients."""
+        """Compute the mean loss of items; `network` is `self.network` with exchange of gradients."""
         ...
 
     def name(self, position: int) -> str:
-        """The file that tells the item at a position from others, for messages."""
+        """Return the name of the item at a position, for messages."""
         ...
 
     def validate(self, network: Callable[..., Any]) -> Validation | None:
-        """Measure the network on pairs for validation."""
+        """Measure the network on validation pairs."""
         ...
 
 
 def join_processes(options: LoopOptions) -> Any:
-    """accelerate's Accelerator of this process and the others that the launcher (torchrun or srun) started."""
+    """Return accelerate's Accelerator, which connects the processes that a launcher (torchrun or srun) started."""
     from accelerate import Accelerator
 
     accelerator = Accelerator(cpu=options.cpu, gradient_accumulation_steps=options.accumulate)
@@ -166,10 +168,13 @@ def join_processes(options: LoopOptions) -> Any:
 def train(
     task: Task, options: LoopOptions, folder: Path, *, say: Callable[[str], None], progress: Progress
 ) -> dict[str, Tensor]:
-    """Train to the last step, resuming from the folder's last state; it receives states/, validation/ and log.jsonl.
+    """Train to the last step, from the folder's newest state if there is one.
 
-    Gives the trained weights by name, or their moving average, on the CPU; nothing in all but the first process.
-    Ctrl-C, SIGTERM as cluster schedulers send it, and errors leave the state of the finished steps.
+    The folder receives states/, validation/ and log.jsonl. After Ctrl-C, a cluster scheduler's SIGTERM or an error, the
+    state of the finished steps is saved.
+
+    Returns:
+        The trained weights by name, or their moving average, on the CPU; empty in all but the first process.
     """
     with interruption_held(terminate=True) as interrupted:
         loop = _Loop(task, options, folder)
@@ -185,13 +190,13 @@ def train(
                 except torch.OutOfMemoryError as error:
                     raise ValueError(
                         f"training: expected memory for {loop.pairs_per_pass} pairs a pass, found too little at step "
-                        f"{loop.step}; the last state is kept: try --accumulate or --lora"
+                        f"{loop.step}; the last state is kept; try --accumulate or --lora"
                     ) from error
                 smooth = loss if smooth is None else smooth + (loss - smooth) / _SMOOTHING_STEPS
                 _log(log, {"step": loop.step, "loss": loss, "rate": task.rate_at(loop.step - 1)})
                 spent = max(time.monotonic() - began, 1e-9)
                 speed = f"{(loop.step - first) * options.batch / spent:.2f} pairs/s"
-                speed += f"; {waited / spent:.0%} of the time waited for pictures"
+                speed += f"; {waited / spent:.0%} of the time spent waiting for pictures"
                 if loop.is_first:
                     progress(loop.step, options.steps, f"loss {smooth:.4f}, {speed}")
                 last = loop.step == options.steps
@@ -204,23 +209,14 @@ def train(
         return loop.result()
 
 
-def read_losses(path: Path) -> list[float]:
-    """Read the loss of each step, in order."""
-    try:
-        entries = [json.loads(line) for line in path.read_text().splitlines()]
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: expected the log of a training, found {error}") from error
-    return [entry["loss"] for entry in entries if "loss" in entry]
-
-
 def list_states(folder: Path) -> list[Path]:
-    """Whole states of a training's folder, oldest first."""
+    """List the complete states of a training's folder, oldest first."""
     return sorted(path for path in (folder / STATES).glob("[0-9]*") if (path / _JOB_FILE).is_file())
 
 
 @dataclass(frozen=True)
 class _Called:
-    """A network as it is called: with what exchanges its gradients, in the arithmetic of the options."""
+    """A network that computes in the precision of the options."""
 
     module: Any
     device: torch.device
@@ -232,7 +228,7 @@ class _Called:
 
 
 class _Loop:
-    """The state of a running training."""
+    """State of a running training."""
 
     def __init__(self, task: Task, options: LoopOptions, folder: Path) -> None:
         self._task, self._options, self._folder = task, options, folder
@@ -251,13 +247,13 @@ class _Loop:
         self._average = {name: p.detach().float().clone() for name, p in self._trained.items()} if options.ema else {}
 
     def _positions(self, step: int) -> list[list[int]]:
-        """Positions that this process takes in a step, pass by pass."""
+        """List this process's positions in a step, by pass."""
         size, count, rank = self.pairs_per_pass, self._processes.num_processes, self._processes.process_index
         begins = (step * self._options.batch + (i * count + rank) * size for i in range(self._options.accumulate))
         return [list(range(begin, begin + size)) for begin in begins]
 
     def batches(self) -> Generator[list[list[Any]]]:
-        """The items of this process, step by step and pass by pass; those of the following steps are read meanwhile."""
+        """Yield the items of this process by step and pass, while threads read the items of the following steps."""
         with ThreadPoolExecutor(self._options.readers) as threads:
             reading: deque[list[list[Any]]] = deque()
             coming = iter(range(self.step, self._options.steps))
@@ -275,7 +271,7 @@ class _Loop:
     def next_passes(
         self, batches: Iterator[list[list[Any]]], interrupted: Callable[[], bool], say: Callable[[str], None]
     ) -> list[list[Any]]:
-        """The items of this step; all processes stop together, as one alone would leave the others waiting for it."""
+        """Return the items of this step; if one process stops, all do, because the others would wait for it forever."""
         from accelerate.utils import gather_object
 
         problem, passes = "", []
@@ -294,7 +290,7 @@ class _Loop:
         raise KeyboardInterrupt
 
     def take_step(self, passes: list[list[Any]]) -> float:
-        """Train on the items of a step; gives their mean loss over all processes."""
+        """Train on the items of a step, and return their mean loss over all processes."""
         for group in self._optimizer.param_groups:
             group["lr"] = self._task.rate_at(self.step)
         total = torch.zeros((), device=self._device)
@@ -321,7 +317,7 @@ class _Loop:
 
     @torch.no_grad()
     def _stop_at_broken_loss(self, passes: list[list[Any]]) -> None:
-        """Save the weights, which are those of the step before, and name the items whose loss is not finite."""
+        """Save the weights of the previous step, and raise an error that names the items without a finite loss."""
         from accelerate.utils import gather_object
 
         items = [item for own in passes for item in own]
@@ -331,7 +327,7 @@ class _Loop:
         self._optimizer.zero_grad()
         self.save()
         raise ValueError(
-            f"training: expected a finite loss and gradient at step {self.step + 1}, found none for {names}; "
+            f"training: expected a finite loss and gradient at step {self.step + 1}, found others for {names}; "
             f"{self._kept_state()}"
         )
 
@@ -341,7 +337,7 @@ class _Loop:
         return not bool(self._processes.gather(torch.tensor([int(broken)], device=self._device)).any())
 
     def validate(self, log: TextIO, say: Callable[[str], None]) -> None:
-        """Measure the resulting weights and log what was found."""
+        """Measure the resulting weights, and log the metrics."""
         try:
             with self._averaged():
                 found = self._task.validate(self._call)
@@ -355,7 +351,7 @@ class _Loop:
         write_image(self._folder / "validation" / f"{self.step:08d}.png", found.sheet)
 
     def result(self) -> dict[str, Tensor]:
-        """The resulting weights with all their parts, on the CPU; only the first of several processes gets them."""
+        """Gather the resulting weights on the CPU of the first process; empty in the others."""
         options = StateDictOptions(full_state_dict=True, cpu_offload=True, ignore_frozen_params=True)
         with self._averaged():
             state: dict[str, Any] = get_model_state_dict(self._network, options=options)
@@ -365,7 +361,7 @@ class _Loop:
 
     @contextmanager
     def _averaged(self) -> Generator[None]:
-        """Within the context, the network has the resulting weights: the moving average where there is one."""
+        """Give the network the resulting weights, the moving average if there is one, within the context."""
         self._network.eval()
         self._exchange()
         try:
@@ -376,7 +372,7 @@ class _Loop:
 
     @torch.no_grad()
     def _exchange(self) -> None:
-        """Exchange weights and averages; one parameter at a time, so that no third copy of the weights is needed."""
+        """Exchange weights and averages one parameter at a time, which needs no third copy of the weights."""
         for name, average in self._average.items():
             current = self._trained[name].detach().clone()
             self._trained[name].copy_(average)
@@ -384,7 +380,7 @@ class _Loop:
 
     @contextmanager
     def log(self) -> Generator[TextIO]:
-        """The open log of the steps up to now; of all but the first process nothing is kept."""
+        """Open the log with the lines of the steps so far; the other processes log to nowhere."""
         if not self.is_first:
             with open(os.devnull, "a") as stream:
                 yield stream
@@ -396,20 +392,20 @@ class _Loop:
                 if json.loads(line)["step"] <= self.step:
                     remaining.append(line)
             except (ValueError, KeyError, TypeError):
-                continue  # an incomplete line of a killed run
+                continue  # a killed run may leave an incomplete line
         with atomic_write(path) as whole:
             whole.write("".join(f"{line}\n" for line in remaining).encode())
         with path.open("a") as stream:
             yield stream
 
     def _job(self) -> dict[str, Any]:
-        """What must be equal for a state to be resumed."""
+        """Return the options and data that must be equal in a resumed run."""
         names = ("batch", "rate", "warm_up", "clip", "ema", "precision", "seed")
         found = {name: asdict(self._options)[name] for name in names} | dict(self._task.fingerprint)
         return json.loads(json.dumps(found))
 
     def _state(self) -> dict[str, Any]:
-        """What a state holds; tensors share their memory with the network's."""
+        """Collect the contents of a state; tensors share their memory with the network's."""
         options = StateDictOptions(ignore_frozen_params=True)
         state: dict[str, Any] = {
             "network": get_model_state_dict(self._network, options=options),
@@ -418,7 +414,7 @@ class _Loop:
         return state | ({"average": self._average} if self._average else {})
 
     def save(self) -> None:
-        """Write the state into a partial folder, rename it when it is whole, and remove all but the newest two."""
+        """Write the state into a partial folder, rename it when it is complete, and remove all but the newest two."""
         if self.step == 0:
             return
         if not self._is_finite():
@@ -441,14 +437,14 @@ class _Loop:
         self._processes.wait_for_everyone()
 
     def resume(self, say: Callable[[str], None]) -> None:
-        """Go on from the newest state that can be read, whatever the number of processes that wrote it."""
+        """Resume from the newest readable state, which any number of processes may have written."""
         states = list_states(self._folder)
-        self._processes.wait_for_everyone()  # all have listed the states before one changes them
+        self._processes.wait_for_everyone()  # no process may change the states before all have listed them
         for path in reversed(states):
             saved, current = json.loads((path / _JOB_FILE).read_text()), self._job()
             if changed := [name for name in current if saved.get(name) != current[name]]:
                 raise ValueError(
-                    f"{self._folder}: expected the same training to go on with, found {changed[0]} "
+                    f"{self._folder}: expected the same training to resume, found {changed[0]} "
                     f"{saved.get(changed[0])} instead of {current[changed[0]]}; name another folder"
                 )
             state = self._state()
@@ -457,7 +453,7 @@ class _Loop:
                     load(state, checkpoint_id=path, no_dist=self._processes.num_processes == 1)
             except _BROKEN_STATE as error:
                 found = (" ".join(str(error).split()) or type(error).__name__)[-200:]
-                say(f"{path}: expected a whole state, found {found}; the one before it is tried")
+                say(f"{path}: expected a complete state, found {found}; the previous one is tried")
                 continue
             options = StateDictOptions(ignore_frozen_params=True, strict=False)
             set_model_state_dict(self._network, state["network"], options=options)
@@ -466,7 +462,7 @@ class _Loop:
             say(f"resumed from step {self.step}")
             return
         if states:
-            raise ValueError(f"{self._folder / STATES}: expected a state that can be read, found none; another folder?")
+            raise ValueError(f"{self._folder / STATES}: expected a readable state, found none; name another folder")
 
     def _kept_state(self) -> str:
         states = list_states(self._folder)
@@ -475,7 +471,7 @@ class _Loop:
 
 @contextmanager
 def _quiet() -> Generator[None]:
-    """Without torch's warning that a single process saves or loads."""
+    """Suppress torch's warning that a single process saves or loads."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "torch.distributed is disabled", UserWarning)
         yield
@@ -489,8 +485,8 @@ def _log(stream: TextIO, entry: dict[str, Any]) -> None:
 def _shard(network: nn.Module, device: torch.device) -> None:
     """Split the network's blocks over the processes, each as one unit, and then the rest.
 
-    Weights are gathered in their own precision, so that the arithmetic is that of `copies`. The rest is split again
-    after each pass too: weights can then be exchanged for their averages at any time.
+    Weights are gathered in their own precision, so that the arithmetic is that of `copies`. All are split again after
+    each pass, so that weights can be exchanged for their averages at any time.
     """
     from torch.distributed.device_mesh import init_device_mesh
     from torch.distributed.fsdp import fully_shard

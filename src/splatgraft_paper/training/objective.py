@@ -1,4 +1,4 @@
-"""Training of image models in latent space: their objectives, a disk cache of latents, and validation on pairs."""
+"""Training of image models in latent space: objectives, a disk cache of latents, and validation on pairs."""
 
 import hashlib
 import os
@@ -28,18 +28,18 @@ MODEL_FOLDER = "model"
 Latents = Mapping[str, Tensor]
 """Latents (b c h w) by role."""
 Network = Callable[..., Any]
-"""The objective's network, as it is called: spread over processes, in 16 bits."""
+"""Call of the objective's network, possibly split over processes or in bfloat16."""
 
 
 class Objective(ABC):
-    """A network between latents of an autoencoder, and the task that it is trained for."""
+    """A network between latents of an autoencoder, with its loss."""
 
     network: Any
-    """A torch module; frozen parameters have requires_grad off."""
+    """Torch module; requires_grad is off for frozen parameters."""
     roles: tuple[Role, ...]
     """Images of a pair that the loss needs."""
     output_role: Role
-    """The image that the network learns to generate."""
+    """Image that the network learns to generate."""
 
     def __init__(self, folder: Path) -> None:
         """Load the frozen autoencoder of a model's folder."""
@@ -54,7 +54,7 @@ class Objective(ABC):
 
     @abstractmethod
     def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
-        """The loss of a batch, with one seed of the noise per pair; `network` calls `self.network`."""
+        """Compute the loss of a batch with one noise seed per pair; `network` calls `self.network`."""
 
     @abstractmethod
     def predict(self, network: Network, latents: Latents, seed: int) -> Float[Tensor, "b 3 h w"]:
@@ -62,14 +62,13 @@ class Objective(ABC):
 
     @abstractmethod
     def save(self, state: dict[str, Tensor], folder: Path) -> None:
-        """Write exactly the weights `state` in the format that inference loads."""
+        """Write the weights `state` in the format of inference."""
 
     def save_model(self, kind: Any, state: Mapping[str, Tensor], folder: Path, prompt: Path) -> None:
         """Write the network, the autoencoder and the prompt's embeddings.
 
-        `save_pretrained` writes what a model holds and takes no other weights. So an empty model of the same config
-        receives them first: the network in training may be split over processes, and holds the last weights, not their
-        average.
+        `save_pretrained` takes no weights, and the network in training may be split over processes and has the last
+        weights instead of their average. So an empty model of the same config receives `state` first.
         """
         with torch.device("meta"):
             empty = kind.from_config(self.network.config)
@@ -82,12 +81,12 @@ class Objective(ABC):
 
 @dataclass(frozen=True)
 class LoadedPair:
-    """What was read of one pair, by role."""
+    """Latents and images of one pair, by role."""
 
     latents: dict[str, Tensor]
-    """Latents that were in the cache."""
+    """Latents found in the cache."""
     pictures: dict[str, Tensor]
-    """Images (3 h w) whose latents were not in the cache."""
+    """Images (3 h w) whose latents are not in the cache."""
     paths: dict[str, Path]
     """Cache file of each role."""
     seed: int = 0
@@ -95,12 +94,12 @@ class LoadedPair:
 
 
 class LatentCache:
-    """Latents by image, of one autoencoder at one size; rounded to bfloat16, also when they are newly encoded."""
+    """Latents of one autoencoder at one size, by image; always rounded to bfloat16, even before they are stored."""
 
     def __init__(
         self, folder: Path, encode: Callable[[Tensor], Tensor], *, width: int, height: int, autoencoder: str
     ) -> None:
-        """Use the cache in `folder`; `encode` is the autoencoder's, whose weights its name identifies."""
+        """Open the cache in `folder`; `encode` is a method of the autoencoder, whose weights its name identifies."""
         self._folder, self._encode = folder, encode
         self._size, self._key_prefix = (width, height), f"{autoencoder}|{width}x{height}"
 
@@ -118,13 +117,13 @@ class LatentCache:
     def encode_missing(
         self, loaded: Sequence[LoadedPair], roles: Sequence[Role]
     ) -> dict[str, Float[Tensor, "b c h w"]]:
-        """Batch the latents of several pairs by role; missing ones are encoded and written to the cache."""
+        """Batch the latents of several pairs by role; encode missing ones and write them to the cache."""
         batch: dict[str, list[Tensor]] = {role: [] for role in roles}
         for item in loaded:
             for role in roles:
                 latents = item.latents.get(role)
                 if latents is None:
-                    # one at a time: batches are rounded differently, and a resumed run would not be bit-identical
+                    # one at a time, because rounding depends on the batch and a resumed run would not be bit-identical
                     latents = self._encode(item.pictures[role][None])[0].to("cpu", torch.bfloat16)
                     _write_latents(item.paths[role], latents)
                 batch[role].append(latents.float())
@@ -136,7 +135,7 @@ class LatentCache:
 
 
 class ObjectiveTask:
-    """An objective on a mixture of pairs, as the training loop takes it."""
+    """An objective on a mixture of pairs, as a task of the training loop."""
 
     def __init__(self, objective: Objective, data: TrainingData, cache: LatentCache, options: LoopOptions) -> None:
         """Move the objective to the device of this process."""
@@ -148,26 +147,26 @@ class ObjectiveTask:
         self.fingerprint: Mapping[str, Any] = {"data": [list(entry) for entry in counts]}
 
     def optimizer(self) -> torch.optim.Optimizer:
-        """Adam without weight decay (paper, Sec. 5.3)."""
+        """Make Adam without weight decay (paper, Sec. 5.3)."""
         return torch.optim.Adam([p for p in self.network.parameters() if p.requires_grad], lr=self._options.rate)
 
     def rate_at(self, step: int) -> float:
-        """Learning rate at a step, counted from 0: constant after the warm-up."""
+        """Return the learning rate at a step, counted from 0; it is constant after the warm-up."""
         warm_up = self._options.warm_up
         return self._options.rate * min(1.0, (step + 1) / warm_up) if warm_up else self._options.rate
 
     def read(self, position: int) -> LoadedPair:
-        """Read the pair at a position with the seed of its noise, which is independent of the number of processes."""
+        """Read the pair at a position; its noise seed does not depend on the number of processes."""
         digest = hashlib.sha256(f"{self._options.seed}|{position}".encode()).digest()
         pair = self.data.mixture.draw(position)
         return self._cache.load(pair, self.objective.roles, int.from_bytes(digest[:7], "big"))
 
     def loss(self, network: Network, items: Sequence[LoadedPair]) -> Float[Tensor, ""]:
-        """The objective's loss."""
+        """Compute the objective's loss."""
         return self.objective.loss(network, self._latents(items), [item.seed for item in items])
 
     def name(self, position: int) -> str:
-        """The picture of the relit object."""
+        """Return the file of the relit object."""
         return str(self.data.mixture.draw(position).relit)
 
     def _latents(self, items: Sequence[LoadedPair]) -> dict[str, Tensor]:
@@ -176,7 +175,7 @@ class ObjectiveTask:
 
     @torch.no_grad()
     def validate(self, network: Network) -> Validation | None:
-        """Metrics of predictions and of the network's input, and rows of input, prediction and target."""
+        """Measure predictions and the network's input; a row of the sheet has input, prediction and target."""
         objective, mixture = self.objective, self.data.held_out or self.data.mixture
         rows, found = [], []
         for files in mixture.all()[: self._options.validation_pairs]:
@@ -211,7 +210,7 @@ class ObjectiveTask:
 def train_objective(
     objective: Objective, data: TrainingData, out: Path, options: LoopOptions, *, base: Path, console: Console
 ) -> Path | None:
-    """Train an objective with `base`'s autoencoder on pairs and write its model; the first process gives its folder."""
+    """Train an objective with `base`'s autoencoder, write its model, and return its folder in the first process."""
     processes = join_processes(options)
     first = processes.is_main_process
     say = console.say if first else lambda sentence: None
@@ -226,7 +225,7 @@ def train_objective(
         out / "latents", objective.autoencoder.encode, width=data.width, height=data.height, autoencoder=name
     )
     task = ObjectiveTask(objective, data, cache, options)
-    # the first of several processes locks the folder; the others write only latents, each file atomically
+    # only the first process locks the folder; the others write nothing but latents, each file atomically
     with console.bar("train") as progress, locked(out) if first else nullcontext():
         state = train(task, options, out, say=say, progress=progress)
         if first:
@@ -236,7 +235,7 @@ def train_objective(
 
 
 def _write_latents(path: Path, latents: Float[Tensor, "c h w"]) -> None:
-    """Write to a temporary name of this process first: several processes may encode the same image at once."""
+    """Write latents; via a temporary file per process, because several may encode the same image at once."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f"{path.stem}-{os.getpid()}.safetensors")
     write_tensors(temporary, {"latents": latents})

@@ -1,8 +1,8 @@
-"""Training pairs on disk, and deterministic mixtures of several folders of them.
+"""Training pairs on disk, and deterministic mixtures of several folders of pairs.
 
-The pair at a position of a mixture depends only on the seed and the position, so that a run can be resumed anywhere.
-Two kinds of folders are read: rendered pairs (`paper synth pairs`), and relit ones (`paper synth generated`, `orida`
-and `spheres`; paper, Sec. 5.2):
+Seed and position determine the pair at a position of a mixture, so that a run can be resumed anywhere. There are two
+kinds of folders (paper, Sec. 5.2): rendered pairs (`paper synth pairs`), described in `synthesis/pairs.py`, and relit
+ones (`paper synth generated`, `orida` and `spheres`):
 
     manifest.jsonl                 one line per sample: folder, group, relit (number of lights), provenance
     NAME/target.png  background.png  mask.png  relit_0.png ..  record.json
@@ -36,23 +36,23 @@ class TrainingPair:
     """One training pair, sRGB in [0, 1]."""
 
     composite: Float[Tensor, "h w 3"]
-    """The object under another light, pasted onto the scene without it (paper, Eq. 2)."""
+    """Object under another light, pasted onto the scene without it (paper, Eq. 2)."""
     target: Float[Tensor, "h w 3"]
-    """The object in the scene."""
+    """Object in the scene."""
     background: Float[Tensor, "h w 3"]
-    """The scene without the object."""
+    """Scene without the object."""
     mask: Float[Tensor, "h w"]
     """Coverage of each pixel by the object, in [0, 1]."""
 
     def picture(self, role: str) -> Float[Tensor, "h w 3"]:
-        """The image of a role; the mask is binary, with three equal channels, as networks take it."""
+        """Return the image of a role; the mask is binary, with three equal channels, as networks expect it."""
         if role == "mask":
             return (self.mask > 0.5).float()[..., None].expand(-1, -1, 3)
         return getattr(self, role)
 
 
 def crop_to_size(image: Float[Tensor, "h w *c"], width: int, height: int) -> Float[Tensor, "{height} {width} *c"]:
-    """Resize to cover `width` x `height` pixels, then crop the centre."""
+    """Resize an image to cover `width` x `height` pixels, then crop it to its centre."""
     h, w = image.shape[:2]
     scale = max(width / w, height / h)
     larger = resize(image, max(width, round(w * scale)), max(height, round(h * scale)))
@@ -61,31 +61,31 @@ def crop_to_size(image: Float[Tensor, "h w *c"], width: int, height: int) -> Flo
 
 
 def crop_pair_to_size(pair: TrainingPair, width: int, height: int) -> TrainingPair:
-    """Resize and crop all images of a pair, see `crop_to_size`."""
+    """Resize and crop all images of a pair (see `crop_to_size`)."""
     images = (crop_to_size(image, width, height) for image in (pair.composite, pair.target, pair.background, pair.mask))
     return TrainingPair(*(torch.clamp(image, 0, 1) for image in images))
 
 
 @dataclass(frozen=True)
 class PairFiles:
-    """The files of one pair."""
+    """Files of one pair."""
 
     group: str
-    """The pair's scene, photograph or object; groups are held out as a whole."""
+    """Scene, photo or object of the pair; groups are held out as a whole."""
     target: Path
     background: Path
     mask: Path
     relit: Path
-    """The object under another light."""
+    """Object under another light."""
 
     def files(self, role: Role) -> tuple[Path, ...]:
-        """The files that the image of a role is made of; the relit object is matched to the one in the scene."""
+        """List the files from which the image of a role is made."""
         if role == "composite":
             return (self.relit, self.target, self.background, self.mask)
         return (getattr(self, role),)
 
     def key(self, role: Role) -> str:
-        """Identify the image of a role by the paths, sizes and times of its files."""
+        """Return a key of the image of a role, from the paths, sizes and times of its files."""
         found = [role]
         for path in self.files(role):
             try:
@@ -96,7 +96,7 @@ class PairFiles:
         return "|".join(found)
 
     def read(self) -> TrainingPair:
-        """Read the pair; its composite has the relit object at the exposure of that in the scene (paper, Eq. 2)."""
+        """Read the pair; its composite has the relit object at the exposure of the one in the scene (paper, Eq. 2)."""
         target, background = read_rgb(self.target), read_rgb(self.background)
         mask, relit = read_mask(self.mask), read_straight_rgb(self.relit)
         for path, picture in ((self.background, background), (self.mask, mask), (self.relit, relit)):
@@ -113,7 +113,7 @@ class PairFolder:
     """All pairs of one folder."""
 
     name: str
-    """Path of the folder; part of a training's fingerprint."""
+    """Path of the folder, which is part of a training's fingerprint."""
     pairs: tuple[PairFiles, ...]
 
 
@@ -133,7 +133,7 @@ def open_rendered(folder: Path) -> PairFolder:
 
 
 def open_relit(folder: Path) -> PairFolder:
-    """List the pairs of a folder of relit samples, one for each sample and light."""
+    """List the pairs of a folder of relit samples, one per sample and light."""
     path = folder / MANIFEST_FILE
     if not path.is_file():
         raise ValueError(
@@ -162,7 +162,7 @@ class RelitSample:
     background: Float[Tensor, "h w 3"]
     mask: Float[Tensor, "h w"]
     relit: Sequence[Float[Tensor, "h w 3"]] = ()
-    """The whole target under other lights, one image per light."""
+    """Whole target under other lights, one image per light."""
 
 
 def write_sample(folder: Path, sample: RelitSample, record: Mapping[str, Any]) -> None:
@@ -177,7 +177,7 @@ def write_sample(folder: Path, sample: RelitSample, record: Mapping[str, Any]) -
 
 
 def write_relit_manifest(out: Path) -> int:
-    """Write one line for each complete sample; returns their number."""
+    """Write one line per complete sample, and return their number."""
     lines = [
         json.dumps({"folder": path.parent.name, **json.loads(path.read_text())})
         for path in sorted(out.glob(f"*/{RECORD_FILE}"))
@@ -189,17 +189,17 @@ def write_relit_manifest(out: Path) -> int:
 
 @dataclass(frozen=True)
 class Mixture:
-    """Several folders from which pairs are drawn by weight."""
+    """Folders from which pairs are drawn by weight."""
 
     names: tuple[str, ...]
     weights: tuple[float, ...]
-    """Relative, one per folder."""
+    """Relative weights, one per folder."""
     pairs: tuple[tuple[PairFiles, ...], ...]
-    """The pairs of each folder that belong to this mixture."""
+    """Pairs of this mixture, by folder."""
     seed: int
 
     def draw(self, position: int) -> PairFiles:
-        """Draw the pair at a position of the infinite sequence; it depends only on seed and position."""
+        """Draw the pair at a position of the infinite sequence; seed and position determine it."""
         rng = random.Random(f"{self.seed}-{position}")
         return rng.choice(self.pairs[rng.choices(range(len(self.pairs)), self.weights)[0]])
 
@@ -214,8 +214,14 @@ def split_mixture(
 ) -> tuple[Mixture, Mixture | None]:
     """Split folders into training and held-out pairs, by whole groups in the order of their names' hashes.
 
-    `weights` are relative, one per folder; `held_out` is the share of the
-    groups of each folder, at least one group, or 0. The second mixture is None where nothing is held out.
+    Args:
+        folders: Folders of pairs.
+        weights: Relative weights, one per folder.
+        held_out: Share of the groups of each folder that is held out, at least one group; or 0.
+        seed: Seed of the order of pairs.
+
+    Returns:
+        The training mixture, and the held-out mixture or None.
     """
     if not folders or not all(folder.pairs for folder in folders):
         empty = next((folder.name for folder in folders if not folder.pairs), "no source")
@@ -249,37 +255,38 @@ class DataOptions:
     orida: tuple[str, ...] = ()
     """Folders that `splatgraft paper synth orida` made."""
     weights: tuple[float, ...] = ()
-    """Relative frequency of each folder, in the order above; the recipe's, or the paper's, where not given."""
+    """Relative frequency of each folder, in the order above; default: the recipe's, or the paper's."""
     size: str = "704x496"
     """Pixels of a training picture, WIDTHxHEIGHT, multiples of 16."""
     held_out: float = 0.05
-    """Share of the scenes that are kept for validation and never trained on."""
+    """Share of the scenes for validation, which are never trained on."""
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Opened folders, split by whole scenes."""
+    """Pairs of the opened folders, split by whole scenes."""
 
     mixture: Mixture
     held_out: Mixture | None
-    """None where nothing is held out."""
+    """Held-out pairs; None without any."""
     width: int
     """Pixels."""
     height: int
     """Pixels."""
     lines: tuple[str, ...] = ()
-    """One for each folder: how much of it is for training, and its share of the pairs that are drawn."""
+    """One line of text per folder: its number of training pairs, and its share of the drawn pairs."""
 
 
 def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -> TrainingData:
-    """Open the folders and hold out scenes; a recipe's sources must all be given, and its weights are the default.
+    """Open the folders and hold out scenes.
 
-    Without a recipe the weights are the paper's, of the sources that are given.
+    All sources of a recipe must be given, and its weights are the default. Without a recipe the default weights are the
+    paper's, for the given sources.
     """
     width, height = parse_image_size(options.size, multiple_of=16)
     given = {"pairs": options.pairs, "generated": options.generated, "orida": options.orida}
     counts = {name: len(folders) for name, folders in given.items()}
-    chosen = recipe or Recipe.read("paper").of(counts)
+    chosen = recipe or Recipe.read("paper").for_folders(counts)
     weights = options.weights or chosen.weights(counts)
     folders = [
         open_rendered(Path(folder)) if name == "pairs" else open_relit(Path(folder))
@@ -291,7 +298,7 @@ def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -
     mixture, held_out = split_mixture(folders, weights=weights, held_out=options.held_out, seed=seed)
     lines = [
         f"data: {len(own)} pairs to train on, {len(folder.pairs) - len(own)} held out, {folder.name}; "
-        f"{share / sum(weights):.0%} of the pairs that are drawn"
+        f"{share / sum(weights):.0%} of the drawn pairs"
         for folder, own, share in zip(folders, mixture.pairs, weights, strict=True)
     ]
     return TrainingData(mixture, held_out, width, height, tuple(lines))

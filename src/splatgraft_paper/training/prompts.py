@@ -1,7 +1,7 @@
-"""Prompts of generated images: the paper's sentence (Sec. 5.3) filled from own lists of words.
+"""Prompts of generated images: the paper's sentence (Sec. 5.3) with words from our own lists.
 
-Objects are movable things of many materials. Environments include the surface that objects stand on. Lightings name a
-direction or hardness, which a harmoniser must recognise. Camera angles keep the floor in view.
+Objects are movable and of many materials. Environments name the surface below the object. Lightings name a direction
+or hardness, which a harmoniser must recognise. Camera angles keep the floor in view.
 """
 
 import random
@@ -66,7 +66,7 @@ ANGLES = (
 
 @dataclass(frozen=True)
 class Prompt:
-    """The words of one prompt."""
+    """Words of one prompt."""
 
     object: str
     environment: str
@@ -75,12 +75,12 @@ class Prompt:
 
     @property
     def text(self) -> str:
-        """The prompt."""
+        """Text of the prompt."""
         return TEMPLATE.format(article="an" if self.object[0] in "aeiou" else "a", **vars(self))
 
 
 def prompt(seed: int, number: int) -> Prompt:
-    """Make prompt `number`: objects alternate in a shuffled order, the other words are drawn at random."""
+    """Make prompt `number`; objects follow a shuffled order, the other words are drawn at random."""
     rng = random.Random(f"prompt-{seed}-{number}")
     turn, place = divmod(number, len(OBJECTS))
     order = random.Random(f"objects-{seed}-{turn}").sample(OBJECTS, len(OBJECTS))

@@ -1,24 +1,15 @@
-"""Recipes of trainings: the paper's experiments as TOML, their options on the command line, and what they will cost."""
+"""Recipes of trainings: the paper's experiments as TOML, their command-line options, and the plan of a training."""
 
 import argparse
-import math
 import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from splatgraft.runtime.console import Console
-from splatgraft_paper.synthesis.jobs import parse_image_size
 from splatgraft_paper.training.loop import LoopOptions
 
 _FOLDER = Path(__file__).with_name("recipe_files")
-_GPU_SECONDS_PER_PAIR = 48 * 3600 * 4 / (50_000 * 4)
-"""FLUX at 704x496 with all weights on an H100: the paper's two days on four for 50K steps of 4 pairs (Sec. 5.3)."""
-_REMOVAL_SECONDS_PER_PAIR = 0.08
-"""Stable Diffusion 2 at 704x496: 4 x 1.1 TFLOP at the 52 TFLOP/s that the paper's harmoniser reaches by the number
-above. An estimate; the paper gives no time."""
-_PAPER_PIXELS = 704 * 496
-_LATENT_BYTES_PER_PIXEL = 16 / 64 * 2  # 16 channels of bfloat16 for 8 x 8 pixels
 
 
 @dataclass(frozen=True)
@@ -26,27 +17,27 @@ class RecipeSource:
     """One source of pairs of a recipe."""
 
     option: str
-    """Name of its option, such as `pairs`."""
+    """Name of the source's option, such as `pairs`."""
     name: str
-    """The paper's name for it."""
+    """The paper's name of the source."""
     targets: int
-    """Consistent pictures, in the paper."""
+    """Number of consistent pictures in the paper."""
     composites: int
-    """Inconsistent pictures, in the paper."""
+    """Number of inconsistent pictures in the paper."""
     weight: float
     """Share of the drawn pairs, relative to the other sources."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A training with all its numbers."""
+    """A training with all its options and sources."""
 
     name: str
     title: str
     command: str
-    """train flux or train removal."""
+    """Command: train flux or train removal."""
     processes: int
-    """GPUs that the paper used."""
+    """Number of GPUs in the paper."""
     options: dict[str, Any]
     """Values of the command's options by name."""
     sources: tuple[RecipeSource, ...]
@@ -55,13 +46,15 @@ class Recipe:
 
     @staticmethod
     def read(name: str) -> "Recipe":
-        """Read a shipped recipe, or a file of your own that ends in .toml."""
+        """Read a shipped recipe, or the user's own .toml file."""
         path = Path(name) if name.endswith(".toml") else _FOLDER / f"{name}.toml"
         if not path.is_file():
             known = ", ".join(sorted(path.stem for path in _FOLDER.glob("*.toml")))
             raise ValueError(f"--recipe: expected a file or one of {known}; found {name}")
         try:
             found = tomllib.loads(path.read_text())
+            if "recipe" in found:
+                return Recipe.read(found["recipe"])._without(found["without"], path.stem, found["title"])
             sources = [RecipeSource(option, **source) for option, source in found["sources"].items()]
             return Recipe(
                 name=path.stem,
@@ -73,10 +66,17 @@ class Recipe:
                 licences=found.get("licences", {}),
             )
         except (tomllib.TOMLDecodeError, KeyError, TypeError) as error:
-            raise ValueError(f"{path}: expected a recipe as shipped ones are, found {error}") from error
+            raise ValueError(f"{path}: expected a recipe with the keys of the shipped ones, found {error}") from error
+
+    def _without(self, option: str, name: str, title: str) -> "Recipe":
+        """Drop one source and its licence, for an ablation of the data."""
+        sources = tuple(source for source in self.sources if source.option != option)
+        dropped = {source.name for source in self.sources if source.option == option}
+        licences = {key: text for key, text in self.licences.items() if key not in dropped}
+        return replace(self, name=name, title=title, sources=sources, licences=licences)
 
     def words(self) -> list[str]:
-        """The options as words of the command line; words that follow them replace them."""
+        """Convert the options to command-line arguments, which later arguments replace."""
         words = []
         for name, value in self.options.items():
             if value is True:
@@ -85,12 +85,12 @@ class Recipe:
                 words += [f"--{name}", str(value)]
         return words
 
-    def of(self, folders: dict[str, int]) -> "Recipe":
-        """The recipe with those of its sources that have folders."""
+    def for_folders(self, folders: dict[str, int]) -> "Recipe":
+        """Drop the sources without folders."""
         return replace(self, sources=tuple(source for source in self.sources if folders.get(source.option)))
 
     def weights(self, folders: dict[str, int]) -> tuple[float, ...]:
-        """The weight of each folder, in the order of `folders`."""
+        """Compute the weight of each folder, in the order of `folders`; all sources need folders."""
         by_option = {source.option: source for source in self.sources}
         if missing := [option for option in by_option if not folders.get(option)]:
             wanted = ", ".join(f"--{option}" for option in by_option)
@@ -101,67 +101,29 @@ class Recipe:
         return tuple(share for folder in shares for share in folder)
 
 
-@dataclass(frozen=True)
-class TrainingCost:
-    """What decides how long a training takes and how much disk it needs."""
+def say_plan(recipe: Recipe | None, loop: LoopOptions, size: str, processes: Any, console: Console) -> None:
+    """Print the plan of a training: steps, size and GPUs; with a recipe, also data and licences.
 
-    loop: LoopOptions
-    size: str
-    """Pixels, WIDTHxHEIGHT."""
-    parameters: int
-    trained: int
-    """Parameters that are trained: fewer with a low-rank adaptation."""
-    removal: bool = False
-    """Whether the object removal is trained, otherwise FLUX."""
-
-    def hours(self, processes: int) -> float:
-        """On so many H100 cards."""
-        pixels = math.prod(parse_image_size(self.size))
-        each = _REMOVAL_SECONDS_PER_PAIR if self.removal else _GPU_SECONDS_PER_PAIR * self.parameters / 11.8e9
-        return self.loop.steps * self.loop.batch * each * pixels / _PAPER_PIXELS / processes / 3600
-
-    @property
-    def state_bytes(self) -> int:
-        """Bytes of two kept states and one that is being written: weights, Adam's moments, the average."""
-        return 3 * self.trained * (4 + 8 + 4 * (self.loop.ema > 0))
-
-
-def say_plan(recipe: Recipe | None, cost: TrainingCost, processes: Any, console: Console) -> None:
-    """Say what a training will run: steps, hours and disk; with a recipe, its data and licences.
-
-    `processes` are accelerate's; a plan without a launcher is for those of the recipe.
+    `processes` is accelerate's Accelerator; without a launcher, the plan is for the recipe's number of processes.
     """
+    if not processes.is_main_process:
+        return
     count = recipe.processes if recipe and processes.num_processes == 1 else processes.num_processes
-    if processes.is_main_process:
-        for line in _plan(recipe, cost, count):
-            console.say(line)
-
-
-def _plan(recipe: Recipe | None, cost: TrainingCost, processes: int) -> list[str]:
-    loop, sources = cost.loop, recipe.sources if recipe else ()
-    pictures = sum(2 * source.targets + source.composites for source in sources)
-    latents = round(pictures * math.prod(parse_image_size(cost.size)) * _LATENT_BYTES_PER_PIXEL)
-    basis = "4 x 1.1 TFLOP a pair at 52 TFLOP/s"
-    basis = basis if cost.removal else "the paper's two days, by pairs, pixels and weights"
-    disk = f"{_size(4 * cost.parameters)} for the model, {_size(cost.state_bytes)} for states"
-    lines = [
-        f"plan: {loop.steps:,} steps of {loop.batch} pairs at {cost.size}, Adam at {loop.rate:g}, on {processes} GPUs",
-        f"hours: about {cost.hours(processes):.2g} on as many H100 (an estimate: {basis})",
-        f"disk: {disk}, {_size(latents) if sources else 'half a byte a pixel'} for latents",
-    ]
-    if recipe is None:
-        return lines
-    total = sum(source.weight for source in sources)
-    for source in sources:
-        drawn = f"{source.weight / total:.0%} of the pairs that are drawn"
-        counts = f"{source.targets:,} targets and {source.composites:,} composites"
-        lines.append(f"data: {source.name} (--{source.option}), {counts}, {drawn}")
-    licences = [f"licence: {name}: {licence}" for name, licence in recipe.licences.items()]
-    return [f"recipe {recipe.name}: {recipe.title}", *lines, *licences]
+    lines = [f"plan: {loop.steps:,} steps of {loop.batch} pairs at {size}, Adam at {loop.rate:g}, on {count} GPUs"]
+    if recipe is not None:
+        lines.insert(0, f"recipe {recipe.name}: {recipe.title}")
+        total = sum(source.weight for source in recipe.sources)
+        for source in recipe.sources:
+            drawn = f"{source.weight / total:.0%} of the drawn pairs"
+            counts = f"{source.targets:,} targets and {source.composites:,} composites"
+            lines.append(f"data: {source.name} (--{source.option}), {counts}, {drawn}")
+        lines += [f"licence: {name}: {licence}" for name, licence in recipe.licences.items()]
+    for line in lines:
+        console.say(line)
 
 
 def arguments_with_recipe(command: str, words: list[str]) -> list[str]:
-    """The words of a command, preceded by those of its recipe, so that the user's own replace them."""
+    """Put the arguments of a command's recipe before the user's own, which replace them."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--recipe")
     name = parser.parse_known_args(words)[0].recipe
@@ -173,9 +135,3 @@ def arguments_with_recipe(command: str, words: list[str]) -> list[str]:
         known = ", ".join(one.name for one in found if one.command == command)
         raise ValueError(f"--recipe: expected a recipe of `{command}` ({known}), found {name} of `{recipe.command}`")
     return [*recipe.words(), *words]
-
-
-def _size(count: int) -> str:
-    if count >= 1e8:
-        return f"{count / 1e9:.{0 if count >= 1e10 else 1}f} GB"
-    return f"{count / 1e6:.0f} MB"

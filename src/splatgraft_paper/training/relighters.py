@@ -1,9 +1,9 @@
-"""Relighting of whole images for training: NVIDIA's DiffusionRenderer, and a simple stand-in without a learned model.
+"""Relighting of whole images for training, by NVIDIA's DiffusionRenderer or a stand-in without a learned model.
 
-DiffusionRenderer (Liang et al. 2025, github.com/nv-tlabs/diffusion-renderer) runs in the user's own installation. Its
-programs for inverse and forward rendering are called with their own command lines by one process that lives as long as
-the relighter (`renderer_worker.py`), so that each model is loaded once. tests/paper/diffusion_renderer_options.json has
-their options as the repository has them. Untested with the real programs and weights.
+DiffusionRenderer (Liang et al. 2025, github.com/nv-tlabs/diffusion-renderer) runs in the user's own installation. One
+process (`renderer_worker.py`) calls its programs for inverse and forward rendering with their command lines and loads
+each model once. tests/paper/diffusion_renderer_options.json lists the programs' options. Untested with the real
+programs and weights.
 """
 
 import contextlib
@@ -27,9 +27,9 @@ from splatgraft.runtime.process import last_line
 
 
 class StandInRelighter:
-    """Multiplies the object by the mean colour of an environment map, without a learned model.
+    """Multiplication of the object by the mean colour of an environment map.
 
-    Only the tint of the light changes, neither its direction nor its shadows: enough to try the road without a GPU.
+    Only the tint of the light changes, but not its direction or shadows; this is enough to try the steps without a GPU.
     """
 
     name = "stand-in of splatgraft (the map's mean colour; not DiffusionRenderer)"
@@ -38,7 +38,7 @@ class StandInRelighter:
     def relight(
         self, image: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"], lights: Sequence[Path]
     ) -> list[Float[Tensor, "h w 3"]]:
-        """Relight the object; the other pixels stay."""
+        """Relight the object by each map; the other pixels do not change."""
         linear, pictures = linear_from_srgb(image), []
         for path in lights:
             found = cv2.imread(str(path), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR)
@@ -52,18 +52,18 @@ class StandInRelighter:
 
 _WORKER = Path(__file__).with_name("renderer_worker.py")
 _INVERSE, _FORWARD = "inference_svd_rgbx.py", "inference_svd_xrgb.py"
-_MULTIPLE = 64  # pixels: sides of the pictures that the models take
+_MULTIPLE = 64  # pixels; the models' pictures have sides that are multiples of it
 
 
 def inverse_arguments(given: Path, out: Path, size: tuple[int, int]) -> list[str]:
-    """Arguments of the inverse renderer: one picture in a sub-folder of `given`, G-buffers as pictures below `out`."""
-    # the configuration's overlap of 6 frames is refused with a single frame
+    """List the inverse renderer's arguments: one picture in a sub-folder of `given`, G-buffers below `out`."""
+    # the program rejects the configuration's overlap of 6 frames for a single frame
     settings = ["inference_n_frames=1", "overlap_n_frames=0", "chunk_mode=first", "image_group_mode=folder"]
     return ["--config", "configs/rgbx_inference.yaml", *_files(given, out, size), *settings]
 
 
 def forward_arguments(buffers: Path, out: Path, lights: Sequence[Path], size: tuple[int, int]) -> list[str]:
-    """Arguments of the forward renderer: the G-buffers below `buffers` under all lights, pictures below `out`."""
+    """List the forward renderer's arguments: G-buffers below `buffers`, pictures under all lights below `out`."""
     settings = ["inference_n_frames=1", "image_group_mode=webdataset", "lora_scale=0.25", "rotate_light=false"]
     maps = f"envlight={json.dumps([str(path) for path in lights])}"
     return ["--config", "configs/xrgb_inference.yaml", *_files(buffers, out, size), *settings, maps]
@@ -75,13 +75,13 @@ def _files(given: Path, out: Path, size: tuple[int, int]) -> list[str]:
 
 
 class DiffusionRenderer:
-    """A relighter: inverse, then forward rendering by DiffusionRenderer's programs, in one long-lived process."""
+    """Inverse, then forward rendering with DiffusionRenderer's programs, in one long-lived process."""
 
     name = "DiffusionRenderer"
     licence = "pictures by NVIDIA's DiffusionRenderer, see its licence"
 
     def __init__(self, checkout: Path, python: Path) -> None:
-        """Check an installation: its programs, and the interpreter that runs them."""
+        """Check an installation: its programs, and their interpreter."""
         for program in (_INVERSE, _FORWARD):
             if not (checkout / program).is_file():
                 raise ValueError(
@@ -101,7 +101,7 @@ class DiffusionRenderer:
     def relight(
         self, image: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"], lights: Sequence[Path]
     ) -> list[Float[Tensor, "h w 3"]]:
-        """Relight the image by each environment map; it is padded by reflection for the models, and results cropped."""
+        """Relight the image by each map; it is padded by reflection for the models, and the results are cropped."""
         height, width = mask.shape
         size = (-(-height // _MULTIPLE) * _MULTIPLE, -(-width // _MULTIPLE) * _MULTIPLE)
         border = (0, size[0] - height, 0, size[1] - width)
@@ -122,7 +122,7 @@ class DiffusionRenderer:
             return relit
 
     def close(self) -> None:
-        """End the process, which the next picture starts again; it also ends with this one."""
+        """End the process; the next picture starts a new one."""
         if self._process is not None:
             _end(self._process)
             self._process = None
@@ -137,7 +137,7 @@ class DiffusionRenderer:
             process.stdin.flush()
             answer: dict[str, Any] = json.loads(process.stdout.readline())
         except (OSError, ValueError):
-            # a process whose pipes have closed may still be ending
+            # the process has closed its pipes, but may still be ending
             self.close()
             answer = {"error": f"its process ended ({last_line(self._log) or 'no output'})"}
         if answer["error"] is not None:
@@ -147,7 +147,7 @@ class DiffusionRenderer:
 
     def _start(self) -> subprocess.Popen[bytes]:
         self.close()
-        # both repositories run their programs with the folder of their code in PYTHONPATH
+        # the programs expect the folder of their code in PYTHONPATH
         path = os.pathsep.join(filter(None, (str(self._checkout), os.environ.get("PYTHONPATH"))))
         with self._log.open("ab") as stream:
             self._process = subprocess.Popen(
@@ -165,7 +165,7 @@ class DiffusionRenderer:
 def _end(process: "subprocess.Popen[bytes]") -> None:
     """Close the pipes of a process and wait for it."""
     if process.stdin is not None and not process.stdin.closed:
-        with contextlib.suppress(OSError):  # it has gone already
+        with contextlib.suppress(OSError):  # the process may have ended
             process.stdin.close()
     process.terminate()
     process.wait()

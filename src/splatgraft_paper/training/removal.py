@@ -1,6 +1,6 @@
-"""Removal of objects and their shadows by Stable Diffusion 2: training and use (paper, Sec. 5.2 and 5.3).
+"""Removal of objects and their shadows by Stable Diffusion 2, training and inference (paper, Sec. 5.2 and 5.3).
 
-The UNet's first layer takes the latents of image and mask beside the noisy latent; it predicts the velocity.
+The UNet's first layer is widened to the noisy latent and the latents of image and mask; it predicts the velocity.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,13 +21,11 @@ from splatgraft.runtime.console import Console
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, Objective, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, open_training_data
-from splatgraft_paper.training.recipes import Recipe, TrainingCost, say_plan
+from splatgraft_paper.training.recipes import Recipe, say_plan
 
 CONDITIONS = 2
-"""Images that condition the network: the image with the object, and the mask."""
-_SAMPLING_STEPS = 20  # DDIM steps of a prediction, set by hand
-_PARAMETERS = 865_000_000  # parameters of Stable Diffusion 2's UNet
-_MULTIPLE = 64  # pixels: 8 of the autoencoder times 8 of the UNet
+"""Number of images that condition the network: the image with the object, and the mask."""
+_MULTIPLE = 64  # pixels; factors of 8 in the autoencoder and 8 in the UNet
 
 
 @dataclass(frozen=True)
@@ -39,21 +37,21 @@ class RemovalTrainingOptions:
     data: DataOptions = field(default_factory=DataOptions)
     loop: LoopOptions = field(default_factory=lambda: LoopOptions(steps=260_000, batch=8, rate=1e-5))
     no_checkpointing: bool = False
-    """Keep activations instead of computing them twice: faster, several times the memory."""
+    """Keep activations instead of computing them twice; faster, but needs several times the memory."""
     recipe: str | None = None
-    """removal or a .toml file: options where you give none."""
+    """Default options: removal or a .toml file."""
     plan: bool = False
-    """Only print what would run: steps, hours, memory per device, disk, licences."""
+    """Print the plan without training: steps, GPUs, data, licences."""
 
 
 class RemovalObjective(Objective):
-    """A UNet that generates the image without the object from the image with it and the object's mask."""
+    """A UNet that generates the image without the object from the image with the object and its mask."""
 
     roles: tuple[Role, ...] = ("background", "target", "mask")
     output_role: Role = "background"
 
     def __init__(self, base: str, say: Callable[[str], None], *, checkpointing: bool = True) -> None:
-        """Load Stable Diffusion 2, or a removal network to continue from: unet/, vae/ and empty_prompt.safetensors."""
+        """Load Stable Diffusion 2 or a removal network: unet/, vae/ and empty_prompt.safetensors."""
         folder = local_folder(base, say, parts=("unet",))
         config = read_config(folder / "unet" / "config.json", "UNet2DConditionModel")
         self._prompt_path = find_prompt(base, folder)
@@ -96,7 +94,7 @@ class RemovalObjective(Objective):
         self.tokens = self.tokens.to(device)
 
     def loss(self, network: Network, latents: Latents, seeds: Sequence[int]) -> Float[Tensor, ""]:
-        """Mean squared error of the velocity."""
+        """Compute the mean squared error of the velocity."""
         clean = latents["background"]
         steps, eps = [], []
         for seed in seeds:
@@ -113,7 +111,7 @@ class RemovalObjective(Objective):
         target = latents["target"]
         size = tuple(target.shape[1:])
         latent = noise(size, seed).to(target.device).expand(target.shape[0], -1, -1, -1)  # pyright: ignore
-        self._schedule.set_timesteps(_SAMPLING_STEPS)
+        self._schedule.set_timesteps(20)  # DDIM steps, set by hand
         for step in self._schedule.timesteps:
             predicted = self._velocity(network, latent, latents, step.expand(len(latent)).to(latent.device))
             latent = self._schedule.step(predicted.float(), step, latent).prev_sample
@@ -135,7 +133,7 @@ class ObjectRemover:
     """A loaded removal network."""
 
     def __init__(self, weights: Path, device: torch.device, say: Callable[[str], None], *, seed: int = 0) -> None:
-        """Load the folder that `train removal` wrote; `seed` is that of the initial noise."""
+        """Load the folder that `train removal` wrote; `seed` determines the initial noise."""
         self._objective = RemovalObjective(str(weights), say, checkpointing=False)
         self._objective.network.to(device).eval().requires_grad_(False)
         self._objective.to(device)
@@ -145,8 +143,8 @@ class ObjectRemover:
     def remove(self, image: Float[Tensor, "h w 3"], mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
         """Remove the object and its shadow.
 
-        Pixels inside the mask are the network's. Elsewhere the network's change is added to the image, so that
-        background and target do not differ by the autoencoder's blur.
+        The network paints pixels inside the mask. Elsewhere its change is added to the image, so that background and
+        target do not differ by the autoencoder's blur.
         """
         height, width = mask.shape
         binary = (mask > 0.5).float()[..., None].expand(-1, -1, 3)
@@ -161,11 +159,10 @@ class ObjectRemover:
 
 
 def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) -> Path | None:
-    """Train the object removal; the first process gives its folder, others None, as where only the plan is printed."""
+    """Train the object removal, return its folder; None in all but the first process, or if only planned."""
     loop, recipe = options.loop, Recipe.read(options.recipe) if options.recipe else None
     if options.plan or recipe:
-        cost = TrainingCost(loop, options.data.size, _PARAMETERS, _PARAMETERS, removal=True)
-        say_plan(recipe, cost, join_processes(loop), console)
+        say_plan(recipe, loop, options.data.size, join_processes(loop), console)
         if options.plan:
             return None
     data = open_training_data(options.data, loop.seed, recipe)

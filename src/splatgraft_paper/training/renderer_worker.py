@@ -1,13 +1,13 @@
-"""Runs DiffusionRenderer's own programs again and again in one process, with its models loaded once.
+"""Run DiffusionRenderer's programs repeatedly in one process and load its models once.
 
-Started by `relighters.py` with DiffusionRenderer's Python, in the folder of its code: nothing of this package
-can be imported here. Standard input has one JSON object per line:
+`relighters.py` starts this file with DiffusionRenderer's Python, in the folder of its code, so it cannot import
+splatgraft. Standard input has one JSON object per line:
 
     {"program": "inference_svd_rgbx.py", "arguments": ["--config", ...]}
 
-and standard output gets one line for each: {"error": null}, or {"error": "ValueError: ..."}. What the programs print
-goes to standard error. The classes that load models are replaced in the programs' modules by ones that keep the last
-object they made, so that a program that is called with the same weights and size finds them loaded.
+For each, one line is written to standard output: {"error": null}, or {"error": "ValueError: ..."}. The programs' own
+output goes to standard error. In the programs' modules, classes that load models are replaced by wrappers that return
+the last model again if the arguments are equal.
 """
 
 import importlib.util
@@ -23,25 +23,25 @@ LOADERS = (
     "CLIPVisionModelWithProjection",
     "CLIPImageProcessor",
 )
-"""Names in the programs whose from_pretrained loads weights."""
+"""Names of classes in the programs whose from_pretrained loads weights."""
 
 
 class Kept:
-    """Stands for a class; what its from_pretrained made last is given again for equal arguments."""
+    """Wrapper of a class that keeps the last object of its from_pretrained."""
 
     def __init__(self, kind):
-        """Keep what `from_pretrained` makes."""
+        """Wrap the class `kind`."""
         self._kind, self._key, self._made = kind, None, None
 
     def __call__(self, *values, **named):
-        """Construct."""
+        """Construct an object of the class."""
         return self._kind(*values, **named)
 
     def from_pretrained(self, *values, **named):
-        """Load, or give what was loaded last."""
+        """Load a model, or return the last one if the arguments are equal."""
         key = [_identity(value) for value in values], {name: _identity(value) for name, value in named.items()}
         if key != self._key:
-            self._key = self._made = None  # the memory of the last one, before the next is loaded
+            self._key = self._made = None  # frees the memory of the last model before the next is loaded
             self._made = self._kind.from_pretrained(*values, **named)
             self._key = key
         return self._made
@@ -55,7 +55,7 @@ def _identity(value):
 
 
 def load(program):
-    """The module of a program, its loading classes replaced."""
+    """Import a program as a module, and wrap its classes that load models."""
     name = os.path.splitext(os.path.basename(program))[0]
     spec = importlib.util.spec_from_file_location(name, program)
     assert spec is not None
@@ -70,13 +70,13 @@ def load(program):
 
 
 def run(module, job):
-    """Call a program as its command line would."""
+    """Run a program's main with the job's command line."""
     sys.argv = [job["program"], *job["arguments"]]
     module.main()
 
 
 def main():
-    """Do the jobs of the standard input until it ends."""
+    """Do the jobs of standard input until it ends."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     sys.path.insert(0, os.getcwd())

@@ -1,7 +1,7 @@
 """Training pairs without Blender: two balls on a floor under a sun and uniform light, in closed form.
 
-One ball belongs to the scene and shows where the light comes from; the other one is the object that is put in. Made for
-the recipe `tiny`, which teaches the whole road of training in minutes.
+One ball belongs to the scene and shows the direction of the light; the other one is the inserted object. The pairs are
+for the recipe `tiny`, which shows all steps of a training in minutes.
 """
 
 import math
@@ -12,9 +12,7 @@ import torch
 
 from splatgraft_paper.training.pairs import RelitSample
 
-_SAMPLES = 3  # rays per pixel and side, so that masks have soft edges
-_FIELD = 0.9  # horizontal field of view, radians
-_UNIFORM = 0.5  # radiance of the uniform light
+_SAMPLES = 3  # rays per pixel in each direction, so that masks have soft edges
 
 
 @dataclass(frozen=True)
@@ -22,13 +20,13 @@ class Sun:
     """A directional light."""
 
     direction: np.ndarray
-    """Unit vector towards it; z is up."""
+    """Unit vector towards the sun; z is up."""
     irradiance: np.ndarray
-    """On a surface that faces it, linear RGB."""
+    """Irradiance of a surface that faces the sun, linear RGB."""
 
 
 def render_spheres(seed: int, *, width: int, height: int, lights: int) -> RelitSample:
-    """Render the scene of a seed, and its view under so many other suns."""
+    """Render the scene of a seed, and its view under `lights` other suns."""
     rng = np.random.default_rng(seed)
     floor, sky = rng.uniform(0.2, 0.6, 3), rng.uniform(0.2, 0.8, 3)
     albedos = [rng.uniform(0.3, 0.7, 1).repeat(3), rng.uniform(0.15, 0.8, 3)]
@@ -61,9 +59,9 @@ def _sun(rng: np.random.Generator) -> Sun:
 
 
 def _rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit rays (h w 3) of a camera that looks down a little, and its place."""
+    """Compute unit rays (h w 3) of a camera that looks slightly down, and its position."""
     eye, down = np.array([0.0, -2.4, 1.3]), 0.4
-    focal = 0.5 * width * _SAMPLES / math.tan(0.5 * _FIELD)
+    focal = 0.5 * width * _SAMPLES / math.tan(0.5 * 0.9)
     v, u = np.meshgrid(np.arange(height * _SAMPLES) + 0.5, np.arange(width * _SAMPLES) + 0.5, indexing="ij")
     x, y = (u - width * _SAMPLES / 2) / focal, (v - height * _SAMPLES / 2) / focal
     forward = np.array([0.0, math.cos(down), -math.sin(down)])
@@ -73,7 +71,7 @@ def _rays(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _distance(rays: np.ndarray, origin: np.ndarray, ball: tuple) -> np.ndarray:
-    """Distance along unit rays to a ball, infinite where there is none."""
+    """Compute the distance along unit rays to a ball, infinite for rays that miss it."""
     centre, radius, _ = ball
     offset = origin - centre
     b, c = (rays * offset).sum(-1), (offset**2).sum(-1) - radius**2
@@ -83,7 +81,7 @@ def _distance(rays: np.ndarray, origin: np.ndarray, ball: tuple) -> np.ndarray:
 
 
 def _radiance(rays: np.ndarray, eye: np.ndarray, balls: list, surroundings: tuple, sun: Sun) -> np.ndarray:
-    """Linear colours (h w 3): albedo / pi times irradiance, with cast shadows and the balls' shade on the floor."""
+    """Shade the nearest surfaces (h w 3), linear: albedo / pi * irradiance, with cast shadows and ambient occlusion."""
     floor, sky = surroundings
     to_floor = np.where(rays[..., 2] < 0, -eye[2] / np.minimum(rays[..., 2], -1e-6), np.inf)
     distances = [to_floor, *(_distance(rays, eye, ball) for ball in balls)]
@@ -105,7 +103,7 @@ def _radiance(rays: np.ndarray, eye: np.ndarray, balls: list, surroundings: tupl
         far = np.linalg.norm(away, axis=-1)
         facing = ((away * normal).sum(-1) / np.maximum(far, 1e-6)).clip(0)
         open_share = open_share * np.where(nearest == number, 1, 1 - facing * np.minimum(1, ball[1] / far) ** 2)
-    irradiance = math.pi * _UNIFORM * open_share[..., None] + lit[..., None] * sun.irradiance
+    irradiance = math.pi * 0.5 * open_share[..., None] + lit[..., None] * sun.irradiance
     return np.where(np.isfinite(t)[..., None], albedo / math.pi * irradiance, sky)
 
 

@@ -1,7 +1,7 @@
 """A base model of three million parameters in FLUX's layout, of the same classes, for the recipe `tiny`.
 
-Its transformer is random. Its autoencoder is trained here for a few minutes on the pictures of the pairs, as a random
-one cannot show a picture; its latents are then scaled to mean 0 and deviation 1, as those of FLUX are.
+The transformer is random. The autoencoder is trained for a few minutes on the pictures of the pairs, because a random
+one cannot reproduce a picture. Its latents are then scaled to mean 0 and deviation 1, as FLUX's are.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,9 +19,8 @@ from splatgraft.harmonization.flux.prompt import PROMPT_FILE, PromptEmbedding, w
 from splatgraft.runtime.files import atomic_folder
 from splatgraft.runtime.progress import Progress
 
-_LATENTS, _TEXT, _POOLED = 16, 32, 32
-_MEAN_STEPS = 50  # steps over which the autoencoder's error is averaged
-_SHOWN = 64  # pictures, at least, whose error is said at the end
+_LATENTS, _TEXT, _POOLED = 16, 32, 32  # channels of latents, text tokens and the pooled text
+_MEAN_STEPS = 50  # steps over which the displayed error is averaged
 
 
 @dataclass(frozen=True)
@@ -33,17 +32,17 @@ class TinyBaseOptions:
     double_blocks: int = 2
     single_blocks: int = 4
     autoencoder_widths: tuple[int, ...] = (24, 48, 64)
-    """Channels of its levels, multiples of 8; each but the first halves the picture."""
+    """Channels of the autoencoder's levels, multiples of 8; each level but the first halves the picture."""
     autoencoder_steps: int = 4000
-    """Steps on parts of pictures, half as wide and half as high."""
+    """Steps of the autoencoder, on parts of pictures with half their width and height."""
     batch: int = 8
     rate: float = 5e-4
-    """Learning rate of Adam, falling to zero along a cosine. With 2e-3 the autoencoder never learns colours."""
+    """Learning rate of Adam, falling to zero along a cosine; with 2e-3 the autoencoder never learns colours."""
     seed: int = 0
 
     @property
     def pixels_per_latent(self) -> int:
-        """Along each side."""
+        """Pixels per latent along each side."""
         return 2 ** (len(self.autoencoder_widths) - 1)
 
 
@@ -55,7 +54,7 @@ def write_tiny_base(
     say: Callable[[str], None],
     progress: Progress,
 ) -> None:
-    """Train the autoencoder on pictures (3 h w), sRGB in [0, 1], all of one size, and write the base model's folder."""
+    """Train the autoencoder on pictures (3 h w) of one size, sRGB in [0, 1], and write the base model's folder."""
     torch.manual_seed(options.seed)
     autoencoder = _autoencoder(options.autoencoder_widths)
     stacked = torch.stack(list(pictures)) * 2 - 1
@@ -65,7 +64,7 @@ def write_tiny_base(
     count = sum(p.numel() for p in transformer.parameters())
     psnr = -10 * torch.log10(torch.tensor(error / 4))
     say(f"base: transformer of {count / 1e6:.1f} million parameters, autoencoder of {_count(autoencoder):.2f} million")
-    say(f"base: the autoencoder shows {len(pictures)} pictures at {float(psnr):.1f} dB")
+    say(f"base: the autoencoder reproduces {len(pictures)} pictures at {float(psnr):.1f} dB")
     with atomic_folder(folder) as new:
         transformer.save_pretrained(new / "transformer")
         autoencoder.save_pretrained(new / "vae")
@@ -104,7 +103,7 @@ def _transformer(options: TinyBaseOptions) -> Any:
 
 
 def _train(autoencoder: Any, pictures: Float[Tensor, "n 3 h w"], options: TinyBaseOptions, progress: Progress) -> float:
-    """Train on parts of random pictures; gives the mean squared error of pictures at the end, of values in [-1, 1]."""
+    """Train on parts of random pictures, and return the final mean squared error of values in [-1, 1]."""
     optimizer = torch.optim.Adam(autoencoder.parameters(), lr=options.rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.autoencoder_steps)
     generator, errors = torch.Generator().manual_seed(options.seed), []
@@ -118,7 +117,7 @@ def _train(autoencoder: Any, pictures: Float[Tensor, "n 3 h w"], options: TinyBa
         latents = autoencoder.encode(batch).latent_dist.mode()
         shown = autoencoder.decode(latents, return_dict=False)[0]
         error = ((shown - batch) ** 2).mean()
-        # absolute errors keep the smooth gradients of shading; a small pull keeps the latents near 0
+        # the absolute error keeps smooth gradients of shading; the last term keeps the latents near 0
         loss = error + 0.1 * (shown - batch).abs().mean() + 1e-4 * (latents**2).mean()
         optimizer.zero_grad()
         loss.backward()
@@ -127,7 +126,7 @@ def _train(autoencoder: Any, pictures: Float[Tensor, "n 3 h w"], options: TinyBa
         errors = [*errors[1 - _MEAN_STEPS :], float(error.detach())]
         progress(step + 1, options.autoencoder_steps, f"autoencoder, error {sum(errors) / len(errors):.4f}")
     with torch.no_grad():
-        some = pictures[:: max(1, len(pictures) // _SHOWN)]
+        some = pictures[:: max(1, len(pictures) // 64)]
         return float(((autoencoder.decode(autoencoder.encode(some).latent_dist.mode()).sample - some) ** 2).mean())
 
 

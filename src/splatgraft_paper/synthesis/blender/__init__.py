@@ -1,1 +1,1 @@
-"""Code that runs in Blender's Python interpreter (bpy and numpy only), in a process of its own."""
+"""Programs for Blender's Python interpreter (bpy and numpy only), run in a process of their own."""

@@ -1,4 +1,4 @@
-"""Measures the true light at a point: a panorama of its environment, and the suns. Runs inside Blender."""
+"""Measure the true light at a point inside Blender: a panorama of its environment, and the suns."""
 
 import math
 
@@ -9,32 +9,30 @@ import scene_builder
 from mathutils import Vector
 
 WIDTH, HEIGHT = 128, 64
-_SAMPLES = 64  # light paths per pixel of the panorama
-_DISC_MARGIN = 2.5 * math.pi / HEIGHT
-"""Radians around the sun's disc, 2.5 pixels: the pixel filter spreads the disc that far."""
-_SUN_PIXELS = 24  # width of the image from which the sky's sun is measured
+_DISC_MARGIN = 2.5 * math.pi / HEIGHT  # radians; the pixel filter spreads the sun's disc by 2.5 pixels
+_SUN_PIXELS = 24  # width and height of the image that measures the sky's sun
 
 
 def measure(scene, world, point, things):
     """Render the radiance (64, 128, 3) around `point` without the suns' discs, and list the suns that reach it.
 
-    In Blender's units. Surfaces are lit by the suns. Row 0 looks up, the middle column along +x; columns run to the
-    right as seen from inside (towards -y).
+    Units are Blender's. Surfaces in the panorama are lit by the suns. Row 0 looks up, the middle column along +x;
+    columns run to the right as seen from inside (towards -y).
     """
     cycles, layer = bpy.context.scene.cycles, bpy.context.scene
     lamps = [thing for thing in things if thing.type == "LIGHT"]
-    # a sun's disc would be in the panorama and in the list
+    # a visible sun would be counted twice, in the panorama and in the list
     shown = [thing for thing in lamps if thing.data.type != "SUN"]
     for thing in shown:
         thing.visible_camera = True
     layer.render.resolution_x, layer.render.resolution_y = WIDTH, HEIGHT
     layer.render.film_transparent = False  # otherwise the world is not rendered
-    cycles.samples = _SAMPLES
+    cycles.samples = 64
     camera = _panoramic(point)
     panorama = _panorama(camera, {**world, "sun_disc": False})
     if world["kind"] == "sky":
-        # what the sun lights is part of the panorama; its disc alone is not
-        cycles.use_denoising = False  # it would spread the disc over its neighbours
+        # the panorama contains surfaces lit by the sun, but not the sun's disc
+        cycles.use_denoising = False  # the denoiser would spread the disc over its neighbours
         with_sun = _panorama(camera, {**world, "sun_disc": True})
         cycles.use_denoising = True
         disc = _around(_towards_sun(world), 0.5 * world["sun_size"] + _DISC_MARGIN)
@@ -53,7 +51,7 @@ def _panorama(camera, world):
 
 
 def _around(towards, angle):
-    """The panorama's pixels (64, 128) within `angle`, radians, of a unit direction."""
+    """Mask the panorama's pixels (64, 128) within `angle`, radians, of a unit direction."""
     height = math.pi * (0.5 - (np.arange(HEIGHT) + 0.5) / HEIGHT)[:, None]
     turn = -2 * math.pi * ((np.arange(WIDTH) + 0.5) / WIDTH - 0.5)[None]
     x, y, z = np.cos(height) * np.cos(turn), np.cos(height) * np.sin(turn), np.sin(height) + 0 * turn
@@ -87,7 +85,7 @@ def _towards_sun(world):
 
 
 def _sky_sun(world, things):
-    """The sun of the Nishita sky, measured by a narrow camera with and without the sun's disc."""
+    """Measure the sun of the Nishita sky, as the difference of narrow renders with and without the sun's disc."""
     towards = _towards_sun(world)
     angle = 2.0 * world["sun_size"]
     camera = scene_builder.add_camera(
@@ -116,7 +114,7 @@ def _sky_sun(world, things):
 
 
 def _reaches(point, direction):
-    """Whether no rendered mesh blocks the sun; objects are hidden from rendering while the light is measured."""
+    """Return whether no rendered mesh blocks the sun; inserted objects are hidden while the light is measured."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     start, towards = Vector(point), Vector(direction).normalized()
     while True:

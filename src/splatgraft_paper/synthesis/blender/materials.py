@@ -1,10 +1,10 @@
-"""Shader node trees for the patterns of `synthesis.scene.Material`. Runs inside Blender."""
+"""Build shader node trees for the patterns of `synthesis.scene.Material` inside Blender."""
 
 import bpy
 
 
 class _Tree:
-    """A material's node tree with shorthands for the nodes of patterns."""
+    """Node tree of a material, with shorthands for the nodes of patterns."""
 
     def __init__(self, name):
         self.material = bpy.data.materials.new(name)

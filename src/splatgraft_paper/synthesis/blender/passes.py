@@ -1,4 +1,4 @@
-"""Renders one view with its passes, and writes images. Runs inside Blender."""
+"""Render one view with its passes inside Blender, and write images."""
 
 import os
 import struct
@@ -62,7 +62,7 @@ def configure(width, height, samples, seed):
 
 
 def render(camera, names, matte=()):
-    """Render one camera; returns arrays by pass: color (linear RGBA), depth, normal, albedo, mask."""
+    """Render one camera and return arrays by pass: color (linear RGBA), depth, normal, albedo, mask."""
     scene = bpy.context.scene
     scene.camera = camera
     with tempfile.TemporaryDirectory() as folder:
@@ -76,7 +76,7 @@ def render(camera, names, matte=()):
 
 
 def _write_passes(folder, names, matte):
-    """Make a compositor tree that writes the passes as EXR files into `folder`."""
+    """Build a compositor tree that writes the passes as EXR files into `folder`."""
     scene = bpy.context.scene
     scene.use_nodes = True
     tree = scene.node_tree

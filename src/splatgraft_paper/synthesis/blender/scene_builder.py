@@ -1,4 +1,4 @@
-"""Builds a scene in Blender from the JSON form of `synthesis.scene.Scene`. Runs inside Blender."""
+"""Build a scene inside Blender from the JSON form of `synthesis.scene.Scene`."""
 
 import json
 import math
@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import bmesh
 import bpy
-import materials  # found in this folder, which the worker puts on the path
-from mathutils import Euler, Matrix, Vector, noise
+import materials  # a module of this folder, which the worker adds to the path
+from mathutils import Euler, Vector, noise
 
 
 def clear():
@@ -30,7 +30,7 @@ def _mesh(name, part):
     return thing
 
 
-# each shape fills a box of size 1
+# each shape fills the unit box
 
 
 def _box(built, part):
@@ -38,7 +38,7 @@ def _box(built, part):
 
 
 def _cushion(built, part):
-    """A box with bulging faces and a little seeded noise."""
+    """Build a box with bulging faces and a little seeded noise."""
     bmesh.ops.create_cube(built, size=1.0)
     bmesh.ops.subdivide_edges(built, edges=built.edges[:], cuts=7, use_grid_fill=True)
     for v in built.verts:
@@ -59,7 +59,7 @@ def _cylinder(built, part):
 
 
 def _turned(built, part):
-    """A surface of revolution about z; the profile's radii are in units of half the width, heights of the height."""
+    """Build a surface of revolution about z; the profile has radii in half widths, heights in heights."""
     points = [Vector((r * 0.5, 0, h - 0.5)) for r, h in part["profile"]]
     verts = [built.verts.new(p) for p in points]
     edges = [built.edges.new(pair) for pair in pairwise(verts)]
@@ -74,7 +74,7 @@ def _extruded(built, part):
 
 
 def _blob(built, part):
-    """A sphere displaced by seeded noise."""
+    """Build a sphere displaced by seeded noise."""
     bmesh.ops.create_icosphere(built, subdivisions=4, radius=0.5)
     offset = Vector((part["seed"] % 89, part["seed"] % 53, 0))
     for v in built.verts:
@@ -83,7 +83,7 @@ def _blob(built, part):
 
 
 def _torus(built, part):
-    """40 x 16 points; `bevel` is the radius of the tube, where the outer radius is 1."""
+    """Build a torus of 40 x 16 points; `bevel` is the radius of its tube relative to the outer radius."""
     rows = []
     for a in (2 * math.pi * i / 40 for i in range(40)):
         circle = (2 * math.pi * j / 16 for j in range(16))
@@ -96,7 +96,7 @@ def _torus(built, part):
 
 
 def _tuft(built, part):
-    """Many bent blades that rise from the bottom centre."""
+    """Build many bent blades that rise from the bottom centre."""
     rng = random.Random(part["seed"])
     for _ in range(90):
         turn, lean, length = rng.uniform(0, 2 * math.pi), rng.uniform(0.1, 1.25), rng.uniform(0.5, 1.0)
@@ -117,7 +117,7 @@ def _tuft(built, part):
 
 
 def _foliage(built, part):
-    """Many small leaves, most of them near the surface of an uneven ellipsoid."""
+    """Build many small leaves, most of them near the surface of an uneven ellipsoid."""
     rng = random.Random(part["seed"])
     leaf = 0.055 / max(part["size"])
     offset = Vector((part["seed"] % 83, part["seed"] % 47, 0))
@@ -145,50 +145,8 @@ _SHAPES = {
 _SMOOTH = {"cushion", "cylinder", "sphere", "turned", "blob", "torus", "tuft"}
 
 
-def _model(part):
-    """All meshes of a model file, scaled to fit the part's box and standing on its bottom."""
-    before = set(bpy.data.objects)
-    if not os.path.isfile(part["path"]):
-        raise ValueError(f"{part['path']}: expected a model file, found none")
-    suffix = os.path.splitext(part["path"])[1].lower()
-    if suffix in (".glb", ".gltf"):
-        bpy.ops.import_scene.gltf(filepath=part["path"])
-    elif suffix == ".obj":
-        bpy.ops.wm.obj_import(filepath=part["path"])
-    elif suffix == ".blend":
-        with bpy.data.libraries.load(part["path"]) as (source, wanted):
-            wanted.objects = source.objects
-        for thing in wanted.objects:
-            bpy.context.scene.collection.objects.link(thing)
-    else:
-        raise ValueError(f"{part['path']}: expected a .glb, .gltf, .obj or .blend model, found '{suffix}'")
-    new = [o for o in bpy.data.objects if o not in before]
-    meshes = [o for o in new if o.type == "MESH"]
-    if not meshes:
-        raise ValueError(f"{part['path']}: expected a model with meshes, found none")
-    bpy.context.view_layer.update()
-    corners = [o.matrix_world @ Vector(c) for o in meshes for c in o.bound_box]
-    low = Vector(min(c[i] for c in corners) for i in range(3))
-    high = Vector(max(c[i] for c in corners) for i in range(3))
-    scale = min(part["size"][i] / max(high[i] - low[i], 1e-6) for i in range(3))
-    place = Matrix.LocRotScale(Vector(part["location"]), Euler(part["rotation"]), Vector((scale,) * 3))
-    # a model that is wider than tall does not fill its box, and stands on the box's bottom
-    lowered = Vector((0, 0, (part["size"][2] / scale - (high[2] - low[2])) / 2))
-    matrix = place @ Matrix.Translation(-(low + high) / 2 - lowered)
-    worlds = {o: o.matrix_world.copy() for o in meshes}
-    for thing in meshes:
-        thing.parent = None
-        thing.matrix_world = matrix @ worlds[thing]
-    return meshes
-
-
 def add_part(part, name, meshes):
-    """Add one part; returns its Blender objects, several for a model of several meshes.
-
-    `meshes` caches geometry and materials, so that equal parts share them.
-    """
-    if part["shape"] == "model":
-        return _model(part)
+    """Add one part and return its Blender object; `meshes` caches geometry and materials of equal parts."""
     key = json.dumps({k: v for k, v in part.items() if k not in ("location", "rotation")}, sort_keys=True)
     if key in meshes:
         thing = bpy.data.objects.new(name, meshes[key])
@@ -202,11 +160,11 @@ def add_part(part, name, meshes):
     if part["bevel"] > 0 and part["shape"] in ("box", "extruded", "cylinder"):
         bevel = thing.modifiers.new("bevel", "BEVEL")
         bevel.width, bevel.segments, bevel.limit_method = part["bevel"], 3, "ANGLE"
-    # large shapes are not subdivided: fifty of them would take gigabytes
+    # large shapes are not subdivided, because fifty of them would take gigabytes
     if part["shape"] in ("turned", "blob") and max(part["size"]) < 0.8:
         smooth = thing.modifiers.new("smooth", "SUBSURF")
         smooth.levels = smooth.render_levels = 1
-    return [thing]
+    return thing
 
 
 def _smooth(thing, part):
@@ -246,7 +204,7 @@ def add_lamp(lamp, name):
 
 
 def environment_path(name):
-    """Resolve a map: an existing path, or the name of a map that comes with Blender."""
+    """Return the path of a map: an existing path, or the name of a map that comes with Blender."""
     if os.path.isabs(name) or os.path.exists(name):
         return name
     return os.path.join(bpy.utils.system_resource("DATAFILES"), "studiolights", "world", name)
@@ -264,7 +222,7 @@ def make_world(world):
         sky = nodes.new("ShaderNodeTexSky")
         sky.sky_type, sky.sun_disc = "NISHITA", world.get("sun_disc", True)
         sky.sun_elevation, sky.sun_size, sky.dust_density = world["sun_elevation"], world["sun_size"], world["haze"]
-        # the node turns clockwise from +y, seen from above
+        # the node's rotation is clockwise from +y, seen from above
         sky.sun_rotation = math.pi / 2 - world["sun_azimuth"]
         links.new(sky.outputs["Color"], background.inputs["Color"])
     elif world["kind"] == "environment":
@@ -279,7 +237,7 @@ def make_world(world):
 
 
 def add_camera(camera, name):
-    """Add one camera; its pose is the object's matrix_world, OpenGL axes."""
+    """Add one camera; the object's matrix_world is its pose, OpenGL axes."""
     data = bpy.data.cameras.new(name)
     data.sensor_fit, data.angle = "HORIZONTAL", camera["field_of_view"]
     data.clip_start, data.clip_end = 0.01, 1000.0

@@ -1,13 +1,11 @@
-"""Samples points on meshes, uniformly by area. Runs inside Blender."""
+"""Sample points on meshes inside Blender, uniformly by area."""
 
 import bpy
 import numpy as np
 
-_MAX_ROUNDS = 60  # rounds of rejection sampling
-
 
 def sample_points(things, sampling, seed):
-    """Sample positions and outward normals (n, 6) in the world, metres; `sampling` has count, center and radius."""
+    """Sample positions and outward normals (n, 6), world axes, metres; `sampling` has count, center and radius."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     corners = [
         found for thing in things if thing.type == "MESH" for found in _triangles(thing.evaluated_get(depsgraph))
@@ -17,14 +15,14 @@ def sample_points(things, sampling, seed):
     triangles = np.concatenate(corners)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     center, radius = np.array(sampling["center"]), sampling["radius"]
-    # triangles wholly outside the sphere are excluded
+    # triangles outside the sphere are excluded
     low, high = triangles.min(1), triangles.max(1)
     near = np.linalg.norm(np.clip(center, low, high) - center, axis=1) < radius
     area = np.linalg.norm(across, axis=1) * near
     if not area.any():
         return np.zeros((0, 6), np.float32)
     rng, found, left = np.random.default_rng(seed), [], sampling["count"]
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(60):  # rejection sampling
         chosen = rng.choice(len(area), sampling["count"], p=area / area.sum())
         points = _points_in(rng, triangles[chosen], across[chosen] / area[chosen, None])
         found.append(points[np.linalg.norm(points[:, :3] - center, axis=1) < radius][:left])
@@ -43,7 +41,7 @@ def _points_in(rng, triangles, normals):
 
 
 def _triangles(thing):
-    """Corners (t, 3, 3) in the world, of an evaluated mesh."""
+    """Return the corners (t, 3, 3) of an evaluated mesh's triangles in a list, world axes; empty without triangles."""
     mesh = thing.to_mesh()
     mesh.calc_loop_triangles()
     vertices = np.empty(3 * len(mesh.vertices))

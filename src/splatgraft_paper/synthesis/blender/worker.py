@@ -1,7 +1,7 @@
-"""Renders one job: `python worker.py job.json`, in a Python with bpy and numpy.
+"""Render one job: `python worker.py job.json`, in a Python with bpy and numpy.
 
-A job has a scene, objects, cameras and takes. A take selects scene or object, the world, and the passes to write. A
-picture with a .done file is not rendered again, so an interrupted job can be resumed.
+A job has a scene, objects, cameras and takes. A take selects scene or object, the world, and the passes to write. An
+interrupted job can be resumed, because pictures with a .done file are not rendered again.
 """
 
 import json
@@ -19,20 +19,20 @@ import passes
 import scene_builder
 import surface_points
 
-_LUMA = np.array([0.2126, 0.7152, 0.0722])  # rec. 709.
-_MID_GREY = 0.22  # linear value to which the exposure brings the geometric mean of luminance; set by hand
-_HIGHLIGHT = 1.3  # largest linear value of the 97th percentile of luminance after exposure; set by hand
+_LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
+_MID_GREY = 0.22  # linear; geometric mean of luminance after exposure, set by hand
+_HIGHLIGHT = 1.3  # linear; maximum of the 97th percentile of luminance after exposure, set by hand
 
 
 def _populate(job):
     scene_builder.clear()
     scene_things, objects, meshes = [], {}, {}
     for i, part in enumerate(job["scene"]["parts"]):
-        scene_things += scene_builder.add_part(part, f"part{i:03d}", meshes)
+        scene_things.append(scene_builder.add_part(part, f"part{i:03d}", meshes))
     for i, lamp in enumerate(job["scene"]["lamps"]):
         scene_things.append(scene_builder.add_lamp(lamp, f"lamp{i:02d}"))
     for key, parts in job["objects"].items():
-        things = [thing for part in parts for thing in scene_builder.add_part(part, key, meshes)]
+        things = [scene_builder.add_part(part, key, meshes) for part in parts]
         for i, thing in enumerate(things):
             thing.name = f"{key}_{i:03d}"
         objects[key] = things
@@ -56,7 +56,7 @@ def _show(take, job, things, worlds):
 
 
 def _exposure(job, take, cameras):
-    """Exposure factor of the take's group, computed from quick renders and stored in exposure.json."""
+    """Return the exposure factor of the take's group, computed from quick renders and stored in exposure.json."""
     path = os.path.join(job["out"], "exposure.json")
     known = {}
     if os.path.exists(path):
@@ -75,7 +75,7 @@ def _exposure(job, take, cameras):
                 levels.append((np.exp(np.log(luma + 1e-4).mean()), np.quantile(luma, 0.97)))
         scene.render.resolution_percentage, scene.cycles.samples = settings
         mean, high = np.mean(levels, 0) if levels else (0.18, 1.0)
-        # mid grey for the mean, but less where more than three per cent of the pixels would clip
+        # the mean becomes mid grey; the exposure is lower if more than three per cent of the pixels would clip
         known[group] = float(min(_MID_GREY / max(mean, 1e-4), _HIGHLIGHT / max(high, 1e-4)))
         with open(path + ".partial", "w") as out:
             json.dump(known, out)

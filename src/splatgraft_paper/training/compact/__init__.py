@@ -1,1 +1,1 @@
-"""Training of the compact harmoniser: pairs, light-transfer priors under perturbed lights, losses and loop."""
+"""Training of the compact harmoniser: pairs, light-transfer priors under perturbed lights, loss and task."""

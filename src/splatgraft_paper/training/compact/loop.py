@@ -1,11 +1,10 @@
 """Training of the compact harmoniser: its task for the training loop, and its loss.
 
-The loss has errors by region, squared errors, gradients, and being worse than the prior. The pairs of a step and their
-augmentation follow from the seed and the step alone.
+The loss sums errors by region, squared errors, errors of gradients, and the excess of errors over the prior's. Seed
+and step determine the pairs of a step and their augmentation.
 """
 
 import math
-import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -20,9 +19,7 @@ from splatgraft.harmonization.compact.network import CompactNetwork, CompactSize
 from splatgraft_paper.training.compact.pairs import CompactPairs, augment, batch_inputs
 from splatgraft_paper.training.loop import LoopOptions, Validation
 
-_BETAS = (0.9, 0.99)  # decay of AdamW's moments
-_FINAL_RATE = 0.02  # learning rate at the last step over the largest
-_SHEET_ROWS = 12
+_FINAL_RATE = 0.02  # learning rate at the last step over the maximum
 
 
 @dataclass(frozen=True)
@@ -32,11 +29,11 @@ class CompactOptions:
     steps: int = 2000
     batch: int = 8
     rate: float = 1e-3
-    """Learning rate of AdamW; rises over the first hundredth of the steps, then falls as a cosine."""
+    """Learning rate of AdamW; it rises over the first hundredth of the steps, then falls as a cosine."""
     decay: float = 0.05
     """Weight decay."""
     ema: float = 0.998
-    """Decay of the averaged weights, which are the result."""
+    """Decay of the moving average of the weights, which is the result."""
     size: tuple[int, int] = (128, 192)
     """Height and width of a training view, multiples of 16."""
     seed: int = 0
@@ -44,71 +41,65 @@ class CompactOptions:
     validate_every: int = 500
     validation_pairs: int = 96
     bf16: bool = False
-    """Compute the network in bfloat16; halves the time on processors that support it."""
+    """Compute the network in bfloat16, which halves the time on processors that support it."""
     network: CompactSize = field(default_factory=CompactSize)
 
     def loop(self, *, cpu: bool) -> LoopOptions:
-        """The options as the training loop takes them."""
+        """Convert to the options of the training loop."""
         names = ("steps", "batch", "rate", "ema", "seed", "save_every", "validate_every", "validation_pairs")
         same = {name: getattr(self, name) for name in names}
         return LoopOptions(**same, precision="bf16" if self.bf16 else "no", readers=1, cpu=cpu)
 
 
 class CompactTask:
-    """The compact network on rendered pairs, as the training loop takes it."""
+    """The compact network on rendered pairs, as a task of the training loop."""
 
-    def __init__(
-        self, pairs: CompactPairs, options: CompactOptions, device: torch.device, begin: dict[str, Tensor] | None = None
-    ) -> None:
-        """Make the network; `begin` holds its initial weights, random where None."""
+    def __init__(self, pairs: CompactPairs, options: CompactOptions, device: torch.device) -> None:
+        """Make the network with random weights."""
         torch.manual_seed(options.seed)
         self._pairs, self._options, self._device = pairs, options, device
         self.network: nn.Module = CompactNetwork(options.network)
-        if begin is not None:
-            self.network.load_state_dict(begin)
         settings: dict[str, Any] = {name: asdict(options)[name] for name in ("steps", "decay", "size", "network")}
-        start = 0.0 if begin is None else sum(float(tensor.double().abs().sum()) for tensor in begin.values())
-        self.fingerprint: Mapping[str, Any] = {**settings, "pairs": pairs.fingerprint(), "begin": start}
+        self.fingerprint: Mapping[str, Any] = {**settings, "pairs": pairs.fingerprint()}
 
     def optimizer(self) -> torch.optim.Optimizer:
-        """AdamW; biases and scales do not decay."""
+        """Make AdamW; biases and scales do not decay."""
         groups = [
             {"params": [p for p in self.network.parameters() if p.ndim > 1], "weight_decay": self._options.decay},
             {"params": [p for p in self.network.parameters() if p.ndim <= 1], "weight_decay": 0.0},
         ]
-        return torch.optim.AdamW(groups, lr=self._options.rate, betas=_BETAS)
+        return torch.optim.AdamW(groups, lr=self._options.rate, betas=(0.9, 0.99))
 
     def rate_at(self, step: int) -> float:
-        """Learning rate at a step, counted from 0."""
+        """Return the learning rate at a step, counted from 0."""
         steps = self._options.steps
         rise = min(1.0, (step + 1) / max(1, steps // 100))
         fall = _FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * step / steps))
         return self._options.rate * (rise * fall)
 
     def read(self, position: int) -> tuple[CompactInput, Tensor]:
-        """Read and augment the view at a position; each epoch has an order of its own."""
+        """Read and augment the view at a position; each epoch has its own order."""
         pairs, seed = self._pairs, self._options.seed
         epoch, place = divmod(position, len(pairs.training))
         order = torch.randperm(len(pairs.training), generator=torch.Generator().manual_seed(seed * 7919 + epoch))
-        name = f"compact-{seed}-{position}"
-        variant = random.Random(name).randrange(pairs.variants)
-        return augment(*pairs.read(pairs.training[int(order[place])], variant), self._options.size, name)
+        whole = pairs.read(pairs.training[int(order[place])])
+        return augment(*whole, self._options.size, f"compact-{seed}-{position}")
 
     def loss(self, network: Callable[..., Any], items: Sequence[tuple[CompactInput, Tensor]]) -> Float[Tensor, ""]:
-        """The loss of a batch of views."""
+        """Compute the loss of a batch of views."""
         view = batch_inputs([view for view, _ in items]).to(self._device)
         truth = torch.cat([truth for _, truth in items]).to(self._device)
         return compact_loss(view, network(view.channels()).float(), truth)[0]
 
     def name(self, position: int) -> str:
-        """The position: pairs are held in memory."""
+        """Return the position, because pairs are in memory."""
         return f"pair {position}"
 
     @torch.no_grad()
     def validate(self, network: Callable[..., Any]) -> Validation:
-        """Errors by region on the held-out pairs, of the network and of the prior.
+        """Measure errors by region on the held-out pairs, of the network and of the prior.
 
-        A row of the sheet shows the composite, the prior, the network's result and the ground truth.
+        A row of the sheet has the composite, the prior, the network's result and the truth.
         """
         pairs, count = self._pairs, self._options.validation_pairs
         chosen = pairs.validation or pairs.training
@@ -116,15 +107,14 @@ class CompactTask:
         totals: dict[str, float] = {}
         rows = []
         for number, index in enumerate(chosen):
-            whole = pairs.read(index, number % pairs.variants)
-            view, truth = augment(*whole, self._options.size, f"validation-{number}")
+            view, truth = augment(*pairs.read(index), self._options.size, f"validation-{number}")
             view, truth = view.to(self._device), truth.to(self._device)
             output = network(view.channels()).float()
             _, errors, prior_errors = compact_loss(view, output, truth)
             for region, error in errors.items():
                 for key, value in ((region, error), (f"{region}_prior", prior_errors[region])):
                     totals[key] = totals.get(key, 0.0) + float(value.mean()) / len(chosen)
-            if number < _SHEET_ROWS:
+            if number < 12:
                 pictures = (view.composite, view.prior(), apply_output(view, output), truth)
                 images = [srgb_from_linear(p[0].clamp(0, 1)).permute(1, 2, 0).cpu() for p in pictures]
                 rows.append(torch.cat(images, 1))
@@ -137,13 +127,13 @@ class LossWeights:
     """Weights and thresholds of the loss, set by hand."""
 
     ratio_offset: float = 0.01
-    """Linear light added to both sides of a ratio."""
+    """Offset on both sides of a ratio, linear light."""
     shadow_ratio: float = 0.95
-    """Truth over background below which a pixel is in shadow."""
+    """Ratio of truth to background below which a pixel is in shadow."""
     max_outside_coverage: float = 0.02
-    """Coverage by the object below which a pixel is off the object."""
+    """Coverage by the object below which a pixel is outside the object."""
     min_area: float = 0.003
-    """Share of the image added to a region's area in its mean, so that small regions count less."""
+    """Share of the image that is added to a region's area in its mean, so that small regions count less."""
     object_and_shadow: float = 0.6
     """Weight of the absolute errors of object and shadow."""
     rest: float = 4.0
@@ -161,20 +151,20 @@ class LossWeights:
     uncertainty: float = 0.02
     """Weight of the likelihood of the expected error."""
     max_light: float = 4.0
-    """Linear light to which the image is clipped where the truth is not clipped."""
+    """Maximum of the image, linear light, at pixels whose truth is not clipped."""
     clipped_truth: float = 0.99
-    """Linear light from which the truth counts as clipped."""
+    """Minimum of a clipped truth, linear light."""
 
 
 WEIGHTS = LossWeights()
 
 
 Errors = dict[str, Float[Tensor, "b"]]
-"""Mean error of each image of a batch, by region: object, shadow and rest."""
+"""Mean errors of the images of a batch, by region: object, shadow and rest."""
 
 
 def regions(view: CompactInput, truth: Float[Tensor, "b 3 h w"]) -> dict[str, Float[Tensor, "b 1 h w"]]:
-    """Weights of the object, of its shadow and of the rest."""
+    """Compute weights of pixels by region: object, its shadow, rest."""
     offset = WEIGHTS.ratio_offset
     ratio = (truth.mean(1, keepdim=True) + offset) / (view.background.mean(1, keepdim=True) + offset)
     outside = (view.mask < WEIGHTS.max_outside_coverage).to(truth)
@@ -191,7 +181,7 @@ def region_errors(image: Float[Tensor, "b 3 h w"], truth: Float[Tensor, "b 3 h w
 def compact_loss(
     view: CompactInput, output: CompactOutput, truth: Float[Tensor, "b 3 h w"]
 ) -> tuple[Tensor, Errors, Errors]:
-    """The loss against the truth in linear light, the errors of the harmonised view, and those of the prior."""
+    """Compute the loss against the truth in linear light, the harmonised view's errors, and the prior's."""
     image = apply_output(view, output)
     errors, prior_errors = region_errors(image, truth, view), region_errors(view.prior(), truth, view)
     loss = WEIGHTS.object_and_shadow * (errors["object"] + errors["shadow"]) + WEIGHTS.rest * errors["rest"]
@@ -210,16 +200,16 @@ def _absolute_error(image: Tensor, truth: Tensor) -> Float[Tensor, "b 1 h w"]:
 
 
 def _clipped(image: Tensor, truth: Tensor) -> Tensor:
-    """Clip the image to 1 where the truth is clipped; elsewhere excess light stays an error."""
+    """Clip the image to 1 where the truth is clipped, so that more light is no error there."""
     unclipped = truth < WEIGHTS.clipped_truth
     return torch.where(unclipped, image.clamp_max(WEIGHTS.max_light), image.clamp_max(1)).clamp_min(1e-6)
 
 
 def _squared_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[Tensor, "b"]:
-    """Squared errors: of sRGB on the object, of the ratio to the background in shadows.
+    """Compute squared errors: of sRGB on the object, of the ratio to the background in shadows.
 
-    Their minimum is the mean of the possible results. That of absolute errors is the median, which is no shadow where a
-    shadow is less likely than not.
+    Squared errors are minimal at the mean of the possible results, absolute errors at the median. The median has no
+    shadow at pixels whose probability of shadow is below one half.
     """
     parts, clipped = regions(view, truth), _clipped(image, truth)
     srgb = (srgb_from_linear(clipped) - srgb_from_linear(truth.clamp(1e-6, 1))) ** 2
@@ -229,14 +219,14 @@ def _squared_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[T
 
 
 def _mean(values: Tensor, weight: Tensor) -> Float[Tensor, "b"]:
-    """Mean over a region of each image; small regions count less than their share."""
+    """Average over a region of each image; small regions count less than their share."""
     area = weight.sum((1, 2, 3))
     image_area = values.shape[-1] * values.shape[-2]
     return (values * weight).sum((1, 2, 3)) / (area + WEIGHTS.min_area * image_area)
 
 
 def _gradient_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[Tensor, "b"]:
-    """Differences of the log ratio between neighbouring pixels, on the object and in its shadow."""
+    """Average the differences of the log ratio between neighbouring pixels, on the object and in its shadow."""
     offset = WEIGHTS.ratio_offset
     ratio = ((_clipped(image, truth) + offset) / (truth + offset)).log().clamp(-2, 2)
     parts = regions(view, truth)
@@ -247,7 +237,7 @@ def _gradient_errors(image: Tensor, truth: Tensor, view: CompactInput) -> Float[
 
 
 def _error_likelihood(image: Tensor, truth: Tensor, output: CompactOutput) -> Tensor:
-    """Negative log likelihood of the error under a Laplace distribution; trains only the expected error."""
+    """Compute the negative log likelihood of the error under a Laplace distribution; it trains the expected error."""
     image, truth = (srgb_from_linear(x.clamp(1e-6, 1)) for x in (image, truth))
     error = (image - truth).abs().mean(1, keepdim=True)
     error = torch.nn.functional.interpolate(error, size=output.log_error.shape[-2:], mode="area")

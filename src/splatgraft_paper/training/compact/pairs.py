@@ -1,4 +1,4 @@
-"""Rendered pairs with their light-transfer priors, held in memory, for training the compact harmoniser."""
+"""Rendered pairs and their light-transfer priors in memory, with augmentation, to train the compact harmoniser."""
 
 import json
 import math
@@ -26,60 +26,57 @@ _LINEAR = linear_from_srgb(torch.arange(256) / 255)
 
 @dataclass(frozen=True)
 class HeldOutOptions:
-    """Pairs that are held out of the training, by family."""
+    """Pairs that are held out of the training."""
 
     materials: tuple[str, ...] = ("brick",)
-    """Material patterns: pairs whose object has one."""
+    """Material patterns; objects with one of them are held out."""
     lights: tuple[str, ...] = ("interior.exr",)
-    """Environment maps: pairs whose object was captured under one."""
+    """Environment maps; objects captured under one of them are held out."""
     every: int = 12
-    """Every so manyth scene is held out; 0 for none."""
+    """Stride of held-out scenes; 0 for none."""
 
 
 @dataclass(frozen=True)
 class CompactPair:
-    """One pair, decoded; pairs share the arrays of one picture."""
+    """One decoded pair; pairs with a common picture share its array."""
 
     folder: str
     light: str
     held_out: bool
     arrays: Mapping[str, np.ndarray]
-    """target, background, relit (RGBA), mask: 8-bit sRGB; depth: float16; normal: int8, in the camera's frame."""
-    log_ratios: Sequence[Float[np.ndarray, "h w 3"]]
-    """Log ratio of the prior, one per variant of the perturbed lights, float16."""
-    confidences: Sequence[float]
-    """Confidence in each of these priors."""
+    """Pictures: target, background, relit (RGBA), mask: 8-bit sRGB; depth: float16; normal: int8, camera's frame."""
+    log_ratio: Float[np.ndarray, "h w 3"]
+    """Log ratio of the prior, float16."""
+    confidence: float
+    """Confidence of the prior."""
 
 
 class CompactPairs:
-    """All pairs of a folder that have priors, decoded."""
+    """All pairs of a folder with priors, decoded."""
 
-    def __init__(
-        self, pairs: Path, priors: Sequence[Path], held_out: HeldOutOptions, progress: Progress = silent
-    ) -> None:
-        """Read all rendered pairs, about 0.6 MB each at 240x160, with a folder of `write_priors` per variant."""
-        self.variants = len(priors)
+    def __init__(self, pairs: Path, priors: Path, held_out: HeldOutOptions, progress: Progress = silent) -> None:
+        """Read all rendered pairs, about 0.6 MB each at 240x160, and the priors that `write_priors` wrote."""
         self.entries: list[CompactPair] = []
         samples = read_manifest(pairs)
         folders = sorted({sample.folder for sample in samples})
         for number, folder in enumerate(folders):
             scene_held_out = held_out.every > 0 and number % held_out.every == held_out.every - 1
-            paths = [found / f"{folder.name}.npz" for found in priors]
-            if all(path.is_file() for path in paths):
+            path = priors / f"{folder.name}.npz"
+            if path.is_file():
                 own = [sample for sample in samples if sample.folder == folder]
-                self.entries += _read_folder(folder, own, paths, None if scene_held_out else held_out)
+                self.entries += _read_folder(folder, own, path, None if scene_held_out else held_out)
             progress(number + 1, len(folders), folder.name)
         if not self.entries:
-            raise ValueError(f"{', '.join(map(str, priors))}: expected priors of the pairs in {pairs}, found none")
+            raise ValueError(f"{priors}: expected priors of the pairs in {pairs}, found none")
         self.training = [i for i, entry in enumerate(self.entries) if not entry.held_out]
         self.validation = [i for i, entry in enumerate(self.entries) if entry.held_out]
 
     def fingerprint(self) -> dict[str, int]:
-        """Counts that must be equal for a training to be resumed."""
-        return {"training": len(self.training), "validation": len(self.validation), "variants": self.variants}
+        """Return the counts that must be equal in a resumed training."""
+        return {"training": len(self.training), "validation": len(self.validation)}
 
-    def read(self, index: int, variant: int = 0) -> tuple[CompactInput, Float[Tensor, "1 3 h w"]]:
-        """A pair at full size with one of its priors, and the ground truth in linear light.
+    def read(self, index: int) -> tuple[CompactInput, Float[Tensor, "1 3 h w"]]:
+        """Read a pair at full size with its prior, and the truth in linear light.
 
         The composite's object keeps the exposure of its own light; it is not normalised as in the paper.
         """
@@ -93,23 +90,24 @@ class CompactPairs:
             composite=_channels_first(composite),
             background=_channels_first(_LINEAR[background.int()]),
             mask=covered[..., 0][None, None],
-            log_ratio=_channels_first(torch.from_numpy(entry.log_ratios[variant]).float()),
+            log_ratio=_channels_first(torch.from_numpy(entry.log_ratio).float()),
             depth=relative_depth(arrays["depth"].float(), mask)[None, None],
             normal=_channels_first(arrays["normal"].float() / 127),
-            prior_confidence=torch.tensor([entry.confidences[variant]]),
+            prior_confidence=torch.tensor([entry.confidence]),
         )
         return view, _channels_first(_LINEAR[arrays["target"].int()])
 
 
 def _read_folder(
-    folder: Path, samples: Sequence[PairSample], priors: Sequence[Path], held_out: HeldOutOptions | None
+    folder: Path, samples: Sequence[PairSample], priors: Path, held_out: HeldOutOptions | None
 ) -> list[CompactPair]:
-    """Read the pairs of a scene; `held_out` is None where the whole scene is held out."""
+    """Read the pairs of a scene; `held_out` is None if the whole scene is held out."""
     job = json.loads((folder / "job.json").read_text())
     cameras = rendered_cameras(folder, tuple(f"{i:04d}" for i in range(len(job["cameras"]))))
     worlds = {take["name"]: take["world"].get("path", "") for take in job["takes"] if take.get("world")}
     picture = cache(_read_image)
-    variants = [_read_priors(path) for path in priors]
+    with np.load(priors, allow_pickle=False) as arrays:
+        found = {name: arrays[name] for name in arrays.files}
     pairs = []
 
     @cache
@@ -123,9 +121,8 @@ def _read_folder(
 
     for sample in samples:
         take = f"{sample.object}_{sample.light}"
-        for path, found in zip(priors, variants, strict=True):
-            if take not in found:
-                raise ValueError(f"{path}: expected a prior of {take}, found none; remove the file to remake it")
+        if take not in found:
+            raise ValueError(f"{priors}: expected a prior of {take}, found none; remove the file to remake it")
         patterns = {part["material"]["pattern"] for part in job["objects"][sample.object]}
         is_held_out = held_out is None or bool(patterns & set(held_out.materials)) or worlds[take] in held_out.lights
         mask = picture(sample.path(sample.object, "mask"))
@@ -140,15 +137,9 @@ def _read_folder(
             "depth": depth,
             "normal": normal,
         }
-        ratios = [found[take][sample.camera] for found in variants]
-        confidences = [float(found[f"{take}_trust"]) for found in variants]
-        pairs.append(CompactPair(folder.name, sample.light, is_held_out, arrays, ratios, confidences))
+        ratio, confidence = found[take][sample.camera], float(found[f"{take}_trust"])
+        pairs.append(CompactPair(folder.name, sample.light, is_held_out, arrays, ratio, confidence))
     return pairs
-
-
-def _read_priors(path: Path) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
 
 
 def _channels_first(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "1 3 h w"]:
@@ -166,7 +157,7 @@ def _read_image(path: Path) -> np.ndarray:
 
 
 Crop = tuple[int, int, int, int]
-"""Top, left, height, width, pixels."""
+"""Rectangle: top, left, height, width, pixels."""
 
 
 @dataclass(frozen=True)
@@ -174,9 +165,9 @@ class Augmentation:
     """Distributions of the augmentation, set by hand. A log factor of x is a factor of e^x."""
 
     min_object_margin: float = 2.0
-    """Smallest crop, as a multiple of the object's extent."""
+    """Minimum size of a crop relative to the object."""
     min_crop: float = 0.4
-    """Smallest crop, as a share of the largest that fits the image."""
+    """Minimum size of a crop relative to the largest crop of the image."""
     mirror: float = 0.5
     """Probability of a mirrored view."""
     level_deviation: float = 0.25
@@ -190,9 +181,9 @@ class Augmentation:
     no_prior: float = 0.08
     """Probability of a view without a prior."""
     max_geometry_noise: float = 0.25
-    """Largest standard deviation of the errors added to normals; a tenth of them is added to the log depth."""
+    """Maximum standard deviation of the errors added to normals; a tenth of them is added to the log depth."""
     geometry_noise_px: int = 8
-    """Pixels over which these errors are alike."""
+    """Distance over which these errors are correlated, pixels."""
 
 
 SETTINGS = Augmentation()
@@ -201,7 +192,7 @@ SETTINGS = Augmentation()
 def augment(
     view: CompactInput, target: Float[Tensor, "1 3 h w"], size: tuple[int, int], seed: str
 ) -> tuple[CompactInput, Float[Tensor, "1 3 i j"]]:
-    """A view (a batch of one) and its truth, augmented to `size` (height, width); the crop has the whole object."""
+    """Augment a view (a batch of one) and its truth to `size` (height, width); the crop contains the whole object."""
     rng = random.Random(seed)
     top, left, height, width = _random_crop(view.mask[0, 0], size, rng)
 
@@ -221,7 +212,7 @@ def augment(
 
 
 def _random_crop(mask: Float[Tensor, "h w"], size: tuple[int, int], rng: random.Random) -> Crop:
-    """A crop with the aspect ratio of `size` that contains the whole object."""
+    """Draw a crop with the aspect ratio of `size` that contains the whole object."""
     h, w = mask.shape
     rows, columns = (mask > 0.05).any(1).nonzero()[:, 0], (mask > 0.05).any(0).nonzero()[:, 0]
     tall, wide = int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
@@ -240,7 +231,7 @@ def _random_crop(mask: Float[Tensor, "h w"], size: tuple[int, int], rng: random.
 
 
 def _change_light(view: CompactInput, target: Tensor, rng: random.Random) -> tuple[CompactInput, Tensor]:
-    """Permute and scale the channels of all light, so that the network cannot recognise scenes by their colours."""
+    """Permute and scale the channels of all light, so that the network does not learn the scenes' colours."""
     order = rng.sample(range(3), 3)
     gain = math.exp(rng.gauss(0.0, SETTINGS.level_deviation)) * torch.tensor(
         [math.exp(rng.gauss(0.0, SETTINGS.tint_deviation)) for _ in range(3)]
@@ -255,7 +246,7 @@ def _change_light(view: CompactInput, target: Tensor, rng: random.Random) -> tup
 
 
 def _change_object_exposure(view: CompactInput, rng: random.Random) -> CompactInput:
-    """Scale the composite's object; the log ratio changes inversely, so that the prior stays the same."""
+    """Scale the composite's object, and its log ratio inversely, so that the prior does not change."""
     shift = rng.gauss(0.0, SETTINGS.object_exposure_deviation) + torch.tensor(
         [rng.gauss(0.0, SETTINGS.object_tint_deviation) for _ in range(3)]
     )
@@ -270,7 +261,7 @@ def _change_object_exposure(view: CompactInput, rng: random.Random) -> CompactIn
 
 
 def _add_geometry_noise(view: CompactInput, rng: random.Random) -> CompactInput:
-    """Add errors to normals and depth, as a reconstruction has."""
+    """Add errors to normals and depth like those of a reconstruction."""
     generator = torch.Generator().manual_seed(rng.randrange(2**31))
     size = view.mask.shape[-2:]
     coarse = (max(2, size[0] // SETTINGS.geometry_noise_px), max(2, size[1] // SETTINGS.geometry_noise_px))
@@ -282,6 +273,6 @@ def _add_geometry_noise(view: CompactInput, rng: random.Random) -> CompactInput:
 
 
 def batch_inputs(views: list[CompactInput]) -> CompactInput:
-    """Concatenate views of one size to a batch."""
+    """Concatenate views of one size into a batch."""
     names = ("composite", "background", "mask", "log_ratio", "depth", "normal", "prior_confidence")
     return CompactInput(**{name: torch.cat([getattr(view, name) for view in views]) for name in names})

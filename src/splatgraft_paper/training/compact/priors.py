@@ -1,6 +1,8 @@
 """Light-transfer priors of rendered pairs under perturbed lights: the log ratio of each pixel's colour.
 
-The light transfer's own functions compute the ratios, at the surface points of the pixels.
+1. The true lights at both places get the errors, uncertainty and confidence of estimates.
+2. Pixels are unprojected to surface points; sampled surface points become surfels that cast shadows.
+3. The light transfer's own functions compute the ratio of new to old light at the points.
 """
 
 import json
@@ -41,45 +43,36 @@ from splatgraft_paper.synthesis.benchmark import rendered_cameras
 from splatgraft_paper.synthesis.pairs import samples_in
 
 _GRAY = torch.tensor([0.5, 0.5, 0.5])
-_MAX_SPREAD_DEG, _MAX_ANGLE_DEG = 20.0, 30.0
-"""The standard deviation of a light's error in direction is drawn from 0 up to the first; the largest error."""
-_LEVEL_DEVIATION, _MAX_LEVEL = 0.35, 1.4
-"""Standard deviation of the log error of a light's overall level, and the largest one. Set by hand, as all below."""
+# errors of lights, set by hand
+_MAX_SPREAD_DEG = 20.0  # degrees; maximum standard deviation of a source's direction
+_MAX_ANGLE_DEG = 30.0  # degrees; maximum error of a source's direction
+_LEVEL_DEVIATION, _MAX_LEVEL = 0.35, 1.4  # standard deviation and maximum of the log error of the overall level
 _TINT_DEVIATION = 0.06  # standard deviation of the log error of each colour channel
-_MAX_STRENGTH_FACTOR, _STRENGTH_DEVIATION = 4.0, 0.45
-"""Largest factor between sources and ambient light, either way; standard deviation in units of its log."""
+_MAX_STRENGTH_FACTOR = 4.0  # maximum error, either way, of the ratio of sources to ambient light
+_STRENGTH_DEVIATION = 0.45  # standard deviation of the log of that error, relative to the log of its maximum
 _MISSED_SHARE = 0.05  # probability that a source is missed
-_COVERAGE, _CONFIDENCE = (0.45, 1.0), (0.6, 1.0)
-"""Ranges of the coverage of the environment, and of a source's confidence."""
-_UNCERTAINTY_OFFSET_DEG, _UNCERTAINTY_FACTOR = 2.0, (0.7, 1.3)
-"""Added to every source's uncertainty; range of the recorded uncertainty over the true spread."""
-_REACH, _REGION_MARGIN = 8.0, 1.2
-"""Extent of the scene's shadow maps in radii of the object, as in `RelightOptions`; radius of the region of occluders
-over it."""
-_OFFSET_M = 0.004  # metres by which a point is raised along its normal, against self-shadowing by its own surfels
-_NORMAL_NOISE_DEG, _NOISE_PX = 12.0, 10
-"""Error of normals, as on Gaussians, and the pixels over which it is alike."""
-_MIN_COVERAGE = 0.02
-"""Coverage from which a pixel gets the object's ratio, and below one minus which it gets the scene's."""
-_SURFEL_NEIGHBOR, _SPACING_STRIDE = 4, 7
-"""The spacing of points is the median distance to this nearest neighbour, measured at every so manyth point."""
-_SURFEL_WIDTH, _MIN_SURFEL_WIDTH, _SURFEL_FLATNESS, _SURFEL_OPACITY_LOGIT = 0.6, 1e-4, 0.1, 3.0
-"""Standard deviation in the surface over the spacing, the smallest one in metres, that along the normal over that in
-the surface, and the opacity."""
+_COVERAGE, _CONFIDENCE = (0.45, 1.0), (0.6, 1.0)  # ranges of the environment's coverage and a source's confidence
+_UNCERTAINTY_OFFSET_DEG = 2.0  # degrees; added to every source's recorded uncertainty
+_UNCERTAINTY_FACTOR = (0.7, 1.3)  # range of the recorded uncertainty relative to the standard deviation
+# geometry, set by hand
+_REACH, _REGION_MARGIN = 8.0, 1.2  # radius of shadow maps in radii of the object (`RelightOptions`); margin on it
+_OFFSET_M = 0.004  # metres along the normal; keeps a point out of the shadow of its own surfels
+_NORMAL_NOISE_DEG, _NOISE_PX = 12.0, 10  # error of normals, as on Gaussians, and its correlation distance, pixels
+_MIN_COVERAGE = 0.02  # minimum coverage by the object, or by the scene, of a pixel that gets its ratio
 
 
 @dataclass(frozen=True)
 class PairPrior:
-    """The light transfer's result for all views of an object captured under one light."""
+    """Result of the light transfer for all views of an object captured under one light."""
 
     log_ratio: Float[Tensor, "v h w 3"]
     """Natural logarithm of the factor on linear colours."""
     prior_confidence: float
-    """Confidence in the target light, see `light_confidence`."""
+    """Confidence in the target light (see `light_confidence`)."""
 
 
 def write_priors(folders: Sequence[Path], out: Path, *, seed: int, progress: Progress = silent) -> None:
-    """Compute the priors of all objects and lights of rendered folders, one .npz each; files that exist are kept."""
+    """Compute the priors of all objects and lights of rendered folders, one .npz each; existing files are kept."""
     out.mkdir(parents=True, exist_ok=True)
     for number, folder in enumerate(folders):
         path = out / f"{folder.name}.npz"
@@ -119,20 +112,20 @@ def light_transfer_priors(folder: Path, object_: str, lights: list[str], *, seed
 
 @dataclass(frozen=True)
 class SurfacePixels:
-    """The surface points visible in the pixels of all cameras, with one object in the scene."""
+    """Surface points visible in the pixels of all cameras, with one object in the scene."""
 
     points: Float[Tensor, "v h w 3"]
-    """World, metres."""
+    """Positions, world, metres."""
     normals: Float[Tensor, "v h w 3"]
-    """Unit, world."""
+    """Unit normals, world."""
     mask: Float[Tensor, "v h w"]
     """Coverage by the object, in [0, 1]."""
     hit: Bool[Tensor, "v h w"]
-    """False where the pixel shows the sky."""
+    """Whether the pixel shows a surface instead of the sky."""
 
 
 def read_pixels(folder: Path, object_: str, cameras: Cameras) -> SurfacePixels:
-    """Read the pixels of an object's take and lift them to points by their depth."""
+    """Read the pixels of an object's take and unproject them by their depth."""
     take, points, normals, masks = folder / object_, [], [], []
     for i in range(len(cameras)):
         path = take / f"{i:04d}_depth.npy"
@@ -153,7 +146,7 @@ def read_pixels(folder: Path, object_: str, cameras: Cameras) -> SurfacePixels:
 
 
 def read_surfels(folder: Path, name: str, color: Float[Tensor, "3"]) -> Gaussians:
-    """Read points sampled on the surface of an object or of the `scene` as surfels."""
+    """Read surface points of an object, or of the `scene`, as surfels."""
     path = folder / f"{name}_surface" / "0000.npy"
     try:
         found = torch.from_numpy(np.load(path, allow_pickle=False).astype(np.float32))
@@ -165,15 +158,16 @@ def read_surfels(folder: Path, name: str, color: Float[Tensor, "3"]) -> Gaussian
 
 
 def surfels(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], color: Float[Tensor, "3"]) -> Gaussians:
-    """Make flat, opaque Gaussians whose width follows the spacing of the points, so that they close the surface."""
-    distances, _ = KDTree(points.numpy()).query(points.numpy()[::_SPACING_STRIDE], k=_SURFEL_NEIGHBOR + 1)
-    width = max(_MIN_SURFEL_WIDTH, _SURFEL_WIDTH * float(np.median(distances[:, -1])))
+    """Make flat, opaque Gaussians that close the surface; their width follows the spacing of the points."""
+    # the spacing is the median distance to the fourth neighbour, measured at every seventh point; set by hand, like all
+    distances, _ = KDTree(points.numpy()).query(points.numpy()[::7], k=5)
+    width = max(1e-4, 0.6 * float(np.median(distances[:, -1])))
     rotations = frames_along(-normals).transpose(1, 2)
     return Gaussians(
         means=points,
-        log_scales=torch.tensor([width, width, _SURFEL_FLATNESS * width]).log().repeat(len(points), 1),
+        log_scales=torch.tensor([width, width, 0.1 * width]).log().repeat(len(points), 1),
         quaternions=quaternion_from_rotation(rotations),
-        opacity_logits=torch.full((len(points),), _SURFEL_OPACITY_LOGIT),
+        opacity_logits=torch.full((len(points),), 3.0),
         sh=((color - 0.5) / C0).repeat(len(points), 1)[:, None],
     )
 
@@ -198,7 +192,7 @@ class _PairTransfer:
         self._scene_maps = scene_shadow_maps(scene_surfels, self._region, self._samples)
 
     def object_log_ratio(self, noise: torch.Generator) -> Float[Tensor, "v h w 3"]:
-        """Log ratio of the object's irradiance; 0 in the other pixels."""
+        """Compute the log ratio of the object's irradiance; 0 in other pixels."""
         pixels, samples = self._pixels, self._samples
         inside = (pixels.mask > _MIN_COVERAGE) & pixels.hit
         normals = torch.nn.functional.normalize(pixels.normals + _smooth_noise(pixels.normals.shape, noise), dim=-1)
@@ -216,7 +210,7 @@ class _PairTransfer:
         return log_ratio
 
     def scene_log_ratio(self) -> Float[Tensor, "v h w 3"]:
-        """Log ratio of the shadow and bounce that the object causes on the scene; 0 in the other pixels."""
+        """Compute the log ratio of the object's shadow and bounce on the scene; 0 in other pixels."""
         pixels, samples = self._pixels, self._samples
         outside = (pixels.mask < 1 - _MIN_COVERAGE) & pixels.hit
         points, normals = pixels.points[outside], pixels.normals[outside]
@@ -232,7 +226,7 @@ class _PairTransfer:
 
 
 def _smooth_noise(shape: torch.Size, generator: torch.Generator) -> Float[Tensor, "v h w 3"]:
-    """Errors of normals as on Gaussians: alike over several pixels."""
+    """Draw errors of normals like those of Gaussians, correlated over several pixels."""
     v, h, w, _ = shape
     coarse = torch.randn(v, 3, max(2, h // _NOISE_PX), max(2, w // _NOISE_PX), generator=generator) * math.tan(
         math.radians(_NORMAL_NOISE_DEG)
@@ -247,7 +241,7 @@ def _probe(folder: Path) -> Light:
 def perturb_light(light: Light, rng: random.Random) -> Light:
     """Draw a copy of a known light with the errors, uncertainty and confidence of an estimate.
 
-    The recorded uncertainty is that of the distribution from which the error in direction was drawn, times a factor.
+    The recorded uncertainty is the standard deviation from which the error in direction was drawn, times a factor.
     """
     spread = rng.uniform(0.0, _MAX_SPREAD_DEG)
     level = math.exp(max(-_MAX_LEVEL, min(_MAX_LEVEL, rng.gauss(0.0, _LEVEL_DEVIATION))))
