@@ -1,4 +1,4 @@
-"""The command line: the table of commands, and the call of one of them with only its own imports."""
+"""The command line: finds a command, imports only its module, and prints errors in one line."""
 
 import importlib
 import os
@@ -54,19 +54,19 @@ class Command:
     place: str
     """MODULE or MODULE:CLASS of the dataclass of its arguments; without a class it is `COMMAND`."""
     summary: str
-    """What it does, in a few words."""
+    """Summary in the list of commands."""
 
     def load(self) -> Any:
-        """The dataclass of the command's arguments; its module is imported."""
+        """Import the command's module and return the dataclass of its arguments."""
         module, _, name = self.place.partition(":")
         return getattr(importlib.import_module(module), name or "COMMAND")
 
 
 @cache
 def commands() -> Mapping[str, Command]:
-    """All commands by name: those of this package, and those that installed packages add (entry point `ENTRY_POINTS`).
+    """Return all commands by name: those of this package and those of installed packages (entry point `ENTRY_POINTS`).
 
-    Such a package gives rows (name, MODULE:CLASS, summary), each name beginning with the entry point's.
+    An entry point names rows (name, MODULE:CLASS, summary); each name begins with the name of the entry point.
     """
     found = {name: Command(f"splatgraft.commands.{module}", summary) for name, module, summary in _TABLE}
     for entry in entry_points(group=ENTRY_POINTS):
@@ -75,8 +75,8 @@ def commands() -> Mapping[str, Command]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns 0 on success, 2 where the user's data or arguments are at fault, 130 on Ctrl-C."""
-    # torch and numba each have a pool of threads; one that spins while it waits takes the cores from the other
+    """Run one command and return its exit status: 0 for success, 2 for bad data or arguments, 130 after Ctrl-C."""
+    # torch and numba each have a pool of threads; idle threads that spin take the cores from the other pool
     # (measured on 2 busy cores: a reconstruction in 5 s instead of 80)
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     # FFmpeg inside OpenCV prints lines of its own about videos that our one line explains
@@ -153,7 +153,7 @@ def _present_name(words: list[str]) -> list[str]:
 
 
 def _group(words: list[str]) -> int:
-    """Help on the commands that begin with these words, or an error that lists them."""
+    """Print help on the commands that begin with these words, or raise a ValueError that lists them."""
     wants_help = bool(words) and words[-1] in ("-h", "--help")
     first = words[:-1] if wants_help else words
     while first and not _below(first):
@@ -174,7 +174,7 @@ def _below(first: Sequence[str]) -> dict[str, str]:
 
 
 def _first_words() -> dict[str, str]:
-    """The commands that begin with a command of one word, and a line for each group that has none."""
+    """Return the summaries of commands of one word with their sub-commands, and one line for each other group."""
     table = commands()
     alone = {name for name in table if " " not in name}
     groups = {name.split()[0] for name in table} - alone

@@ -1,4 +1,4 @@
-"""Results wanted and finished: a job, the record of its run in step.json, and whether the record still fits the job."""
+"""Records of results: the job of a step, the record of its run in step.json, and why a result is stale."""
 
 import hashlib
 import json
@@ -13,9 +13,9 @@ from splatgraft.runtime.note import Note
 
 STEP_FILE = "step.json"
 Entry = tuple[str, int, int, str]
-"""Name, size in bytes, modification time in ns, sha256 of one input file."""
+"""Name, size in bytes, modification time in ns and SHA-256 of one input file."""
 
-_LONGEST_REASON = 100  # characters; what changed is left out where it is longer
+_LONGEST_REASON = 100  # characters; longer reasons omit the values
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Job:
     step: str
     """The command."""
     folder: Path
-    """Where the result goes."""
+    """Folder of the result."""
     inputs: Mapping[str, tuple[Path, ...]]
     """Files whose content the result depends on, by role."""
     options: Mapping[str, Any]
@@ -35,7 +35,7 @@ class Job:
 
     @cached_property
     def entries(self) -> Mapping[str, tuple[Entry, ...]]:
-        """The input files at the first access, by role; a ValueError where one is missing."""
+        """Entries of the input files by role, as of the first access; raises ValueError if a file is missing."""
         return {role: input_entries(files, ()) for role, files in self.inputs.items()}
 
     @property
@@ -47,7 +47,7 @@ class Job:
 
 
 def input_entries(files: Iterable[Path], known: tuple[Entry, ...]) -> tuple[Entry, ...]:
-    """One entry per file; the hash is taken from `known` where name, size and modification time are the same."""
+    """Return one entry per file; a hash is reused from `known` if name, size and modification time are equal."""
     hashes = {entry[:3]: entry[3] for entry in known}
     entries: list[Entry] = []
     for path in files:
@@ -82,11 +82,11 @@ class Record:
     peak_memory_bytes: int
     """Largest resident memory while it ran."""
     warnings: tuple[Note, ...] = ()
-    """What may be wrong with the result, in the order in which it was said; pictures are relative to the folder."""
+    """Warnings in the order in which they were printed; pictures are relative to the folder."""
 
 
 def read_record(folder: Path) -> Record | None:
-    """Read the record of a finished result; None where there is none, a ValueError where step.json is damaged."""
+    """Read the record of a finished result, None if there is none; raises ValueError if step.json is damaged."""
     path = folder / STEP_FILE
     if not path.is_file():
         return None
@@ -100,7 +100,7 @@ def read_record(folder: Path) -> Record | None:
 
 
 def why_stale(job: Job) -> str | None:
-    """Say in a few words why the folder's content is not what `job` would make; None where it is."""
+    """Describe in a few words why the folder is not the result of `job`; None if it is."""
     record = read_record(job.folder)
     if record is None:
         return "not made yet"
