@@ -1,4 +1,4 @@
-"""The command `doctor`: what is installed, what is missing, and the command that installs it."""
+"""The command `doctor`: installed and missing packages, with the command that installs each."""
 
 import os
 import platform
@@ -14,7 +14,7 @@ from splatgraft.runtime.optional_dependencies import OPTIONAL_DEPENDENCIES
 
 @dataclass(frozen=True)
 class Doctor:
-    """Say what is installed, what is missing and how to install it."""
+    """List installed and missing packages, and how to install the missing ones."""
 
     def execute(self, console: Console) -> int:
         """Print one line per item; a missing optional dependency is no error."""

@@ -16,7 +16,7 @@ class Status:
     project: Positional = Path("project.toml")
     """The project file, or its folder."""
     out: Path | None = None
-    """Where the results are; the folder of the project file where not given."""
+    """Folder of all results; the folder of the project file if not given."""
 
     def execute(self, console: Console) -> int:
         """Print one line per step."""

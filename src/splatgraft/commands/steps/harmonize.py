@@ -1,4 +1,4 @@
-"""The command `harmonize`: rendered views become harmonised views, one image each."""
+"""The command `harmonize`: make one harmonised image of each rendered view."""
 
 import shutil
 from collections.abc import Callable
@@ -23,12 +23,12 @@ from splatgraft.project.step import Context, Device, Inputs, Positional, plain_o
 
 @dataclass(frozen=True)
 class Harmonize:
-    """Make the light of each view agree with an image model; views that a killed run finished are kept."""
+    """Make the light of each view agree, by an image model; finished views of a killed run are kept."""
 
     views: Positional
     """The folder that `splatgraft render` wrote for a composite."""
     out: Path = Path("harmonized")
-    """Folder for images/, and confidence/ where the method estimates its reliability per pixel."""
+    """Folder for images/, and confidence/ if the method estimates its reliability per pixel."""
     method: (
         Annotated[NoneOptions, subcommand("none")]
         | Annotated[CompactOptions, subcommand("compact")]
@@ -37,9 +37,9 @@ class Harmonize:
     ) = field(default_factory=NoneOptions)
     """The image model; its options are further keys of the table, or options of the sub-command."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
     processes: int = 1
-    """GPUs of this machine, or with --ray workers anywhere, over which the views are split."""
+    """Number of GPUs of this machine, or with --ray of workers anywhere, that share the views."""
     ray: str | None = None
     """Address of a Ray cluster whose machines all see the folders."""
 
@@ -55,14 +55,14 @@ class Harmonize:
         return files
 
     def recorded_options(self) -> dict[str, Any]:
-        """The options in step.json: the method and its own."""
+        """Return the options for step.json: the method's name and its own options."""
         lora = getattr(self.method, "lora", None)
-        # a path is left out of plain options, but `consolidate` with updates makes the method again
+        # plain options omit paths, but `consolidate` with updates needs this one to make the method again
         given = {} if lora is None else {"lora": str(lora.resolve())}
         return plain_options({"method": self.method.name, **vars(self.method)}) | given
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make one image per view."""
+        """Write one image per view."""
         kept, views = context.checkpoint.folder, ViewFolder.open(self.views)
         picture_folders(kept)
         whole = Part(self.views, self.method, kept, device=self.device)
