@@ -56,6 +56,16 @@ def test_only_content_and_options_make_stale(tmp_path: Path, image: Path) -> Non
     assert why_stale(job(folder, (image,), iterations=7)) == "scene.ply was removed"
 
 
+def test_files_of_many_gigabytes_are_compared_by_size_and_time(tmp_path: Path) -> None:
+    weights = tmp_path / "model.safetensors"
+    with weights.open("wb") as stream:
+        stream.truncate(5 << 30)  # a sparse file, which takes no room
+    finish(job(tmp_path / "scene", (weights,)))
+    assert why_stale(job(tmp_path / "scene", (weights,))) is None
+    os.utime(weights, (0, 0))
+    assert why_stale(job(tmp_path / "scene", (weights,))) == "images: model.safetensors changed"
+
+
 def test_an_option_that_a_later_version_brought_is_fresh_at_its_default(tmp_path: Path) -> None:
     done = job(tmp_path / "scene", iterations=7)
     finish(done)

@@ -20,6 +20,9 @@ from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.harmonization import HARMONIZERS, CompactOptions, EditOptions, FluxOptions, NoneOptions
 from splatgraft.project.step import Context, Device, Inputs, Positional, plain_options
 
+_WEIGHTS = ("weights", "base", "model", "lora")  # options of the methods that name weights
+_WEIGHT_SUFFIXES = (".json", ".safetensors", ".bin")  # a training's folder also holds logs and pictures
+
 
 @dataclass(frozen=True)
 class Harmonize:
@@ -44,15 +47,10 @@ class Harmonize:
     """Address of a Ray cluster whose machines all see the folders."""
 
     def inputs(self) -> Inputs:
-        """All pictures of all views, and the small files that identify the weights."""
-        files: dict[str, tuple[Path, ...]] = {"views": ViewFolder.open(self.views).files()}
-        lora = getattr(self.method, "lora", None)
-        weights = getattr(self.method, "weights", None) or getattr(self.method, "model", None)
-        if lora is not None:
-            files["lora"] = (lora,)
-        if weights is not None and Path(weights).is_dir():
-            files["weights"] = tuple(sorted(Path(weights).glob("**/*.json")))
-        return files
+        """Return all pictures of all views, and the files of weights on this machine; hub ids are options."""
+        named = [path for name in _WEIGHTS if (path := getattr(self.method, name, None)) is not None]
+        weights = tuple(file for path in named for file in _weight_files(path))
+        return {"views": ViewFolder.open(self.views).files(), "weights": weights}
 
     def recorded_options(self) -> dict[str, Any]:
         """Return the options for step.json: the method's name and its own options."""
@@ -78,6 +76,14 @@ class Harmonize:
         for name in ("images", "confidence"):
             if any((kept / name).iterdir()):
                 shutil.copytree(kept / name, folder / name)
+
+
+def _weight_files(named: Path | str) -> list[Path]:
+    """List the files of a file or folder of weights; none of a hub id."""
+    path = Path(named)
+    if path.is_dir():
+        return [file for file in sorted(path.rglob("*")) if file.suffix in _WEIGHT_SUFFIXES]
+    return [path] if path.is_file() or isinstance(named, Path) else []
 
 
 def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
