@@ -9,6 +9,7 @@ from importlib.metadata import PackageNotFoundError, version
 import torch
 
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.kernels import threading_layer
 from splatgraft.runtime.optional_dependencies import OPTIONAL_DEPENDENCIES
 
 
@@ -22,7 +23,7 @@ class Doctor:
             ("splatgraft", version("splatgraft")),
             ("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
             ("torch", f"{torch.__version__}, {torch.get_num_threads()} threads"),
-            ("numba", version("numba")),
+            ("numba", f"{version('numba')}, threads by {threading_layer()}"),
             ("processor", f"{_cores()} cores"),
             ("memory", _memory()),
             ("disk", f"{shutil.disk_usage('.').free / 2**30:.0f} GiB free here"),

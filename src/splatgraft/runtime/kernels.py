@@ -14,6 +14,8 @@ KERNEL_LOCK = threading.Lock()
 """Held while a kernel runs: without OpenMP numba uses its workqueue layer, which aborts the process when two threads
 start kernels at the same time."""
 
+# OpenMP shares its threads with torch. TBB, numba's first choice, may wait for minutes at the end of a busy process.
+numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 
 _IMPORT = re.compile(rb"^(?:from [\w.]+ )?import (?:\([^)]*\)|.*)", re.MULTILINE)
 
@@ -50,6 +52,12 @@ def _hash_of_sources(file: Path) -> str:
         words = set(re.findall(rb"\w+", imports))
         found = {path for path in sources if path.stem.encode() in words} - reached
     return hashlib.sha256(b"\0".join(sources[path] for path in sorted(reached))).hexdigest()
+
+
+def threading_layer() -> str:
+    """Return the library whose threads run numba's kernels: omp, else workqueue; NUMBA_THREADING_LAYER overrides it."""
+    numba.get_num_threads()  # chooses the layer
+    return numba.threading_layer()
 
 
 def serialized(kernel: Callable[..., Any]) -> Callable[..., Any]:
