@@ -31,7 +31,7 @@ class Status:
 
 
 def _cost(record: Record | None) -> tuple[str, str]:
-    return (f"{record.seconds:.1f}", f"{record.peak_memory_bytes / 2**30:.2f} GiB") if record else ("", "")
+    return (f"{record.seconds:.1f}", record.memory) if record else ("", "")
 
 
 COMMAND = Status

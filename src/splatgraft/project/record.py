@@ -13,7 +13,11 @@ from splatgraft.runtime.note import Note
 
 STEP_FILE = "step.json"
 Entry = tuple[str, int, int, str]
-"""Name, size in bytes, modification time in ns and SHA-256 of one input file."""
+"""Name, size in bytes, modification time in ns and SHA-256 of one input file.
+
+The hash of a file above `_MAX_HASHED_BYTES` is that of its size and modification time.
+"""
+_MAX_HASHED_BYTES = 4 << 30  # hashing more takes over 10 s; only networks' weights and long videos are larger
 
 _LONGEST_REASON = 100  # characters; longer reasons omit the values
 
@@ -54,7 +58,9 @@ def input_entries(files: Iterable[Path], known: tuple[Entry, ...]) -> tuple[Entr
         try:
             status = path.stat()
             key = (path.name, status.st_size, status.st_mtime_ns)
-            if key not in hashes:
+            if key not in hashes and status.st_size > _MAX_HASHED_BYTES:
+                hashes[key] = hashlib.sha256(repr(key[1:]).encode()).hexdigest()
+            elif key not in hashes:
                 with path.open("rb") as stream:
                     hashes[key] = hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError as error:
@@ -80,9 +86,14 @@ class Record:
     seconds: float
     """Wall time of the run that finished; earlier, killed runs do not count."""
     peak_memory_bytes: int
-    """Largest resident memory while it ran."""
+    """Largest resident memory while it ran; 0 if unknown."""
     warnings: tuple[Note, ...] = ()
     """Warnings in the order in which they were printed; pictures are relative to the folder."""
+
+    @property
+    def memory(self) -> str:
+        """The largest resident memory in GiB, as text; empty if unknown."""
+        return f"{self.peak_memory_bytes / 2**30:.2f} GiB" if self.peak_memory_bytes else ""
 
 
 def read_record(folder: Path) -> Record | None:

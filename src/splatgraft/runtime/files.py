@@ -78,8 +78,11 @@ def _exchange(a: Path, b: Path) -> bool:
 
 def _flush(folder: Path) -> None:
     """Write all content to the disk before the rename, so that a power failure cannot leave empty files."""
+    on_windows = sys.platform == "win32"  # it opens no folders, and flushes only files that are open for writing
     for path in [*folder.rglob("*"), folder]:
-        descriptor = os.open(path, os.O_RDONLY)
+        if on_windows and path.is_dir():
+            continue
+        descriptor = os.open(path, os.O_RDWR if on_windows else os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:

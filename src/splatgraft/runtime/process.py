@@ -2,7 +2,6 @@
 
 import logging
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -125,12 +124,16 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_bytes() -> int:
-    """Return the peak of resident memory since the last reset, in bytes."""
+    """Return the peak of resident memory since the last reset, in bytes; 0 on Windows, which has no such count."""
     status = Path("/proc/self/status")
     if status.is_file():
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
+    try:
+        import resource  # absent on Windows
+    except ModuleNotFoundError:
+        return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 

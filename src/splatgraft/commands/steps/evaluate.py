@@ -211,7 +211,7 @@ def _records(project: Path) -> Iterator[tuple[str, Path, Record]]:
 
 def _step_times(project: Path) -> tuple[StepTime, ...]:
     return tuple(
-        StepTime(label, record.seconds, f"at most {record.peak_memory_bytes / 2**30:.2f} GiB of memory")
+        StepTime(label, record.seconds, f"at most {record.memory} of memory" if record.memory else "")
         for label, _, record in _records(project)
     )
 
