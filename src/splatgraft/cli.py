@@ -38,14 +38,6 @@ _TABLE = (
     ("doctor", "doctor", "say what is installed, what is missing and how to get it"),
 )
 
-_RENAMED = {
-    "evaluate benchmark": "paper benchmark",
-    "evaluate paper": "paper tables",
-    "synth": "paper synth",
-    "train": "paper train",
-}
-"""Commands of version 0.1.0 that are understood for one more version."""
-
 
 @dataclass(frozen=True)
 class Command:
@@ -110,7 +102,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    words = _present_name(words)
     table = commands()
     lengths = (length for length in range(min(3, len(words)), 0, -1) if " ".join(words[:length]) in table)
     length = next(lengths, 0)
@@ -124,9 +115,8 @@ def _dispatch(words: list[str]) -> int:
     from splatgraft.runtime.console import Console
 
     console, kind = Console(), table[command].load()
-    for place in (kind, sys.modules[table[command].place.partition(":")[0]]):
-        if hasattr(place, "current_arguments"):
-            rest = place.current_arguments(rest, console.say)
+    if hasattr(kind, "current_arguments"):
+        rest = kind.current_arguments(rest, console.say)
     options = tyro.cli(
         kind,
         prog=f"splatgraft {command}",
@@ -140,16 +130,6 @@ def _dispatch(words: list[str]) -> int:
 
     console.result(perform(options, console))
     return 0
-
-
-def _present_name(words: list[str]) -> list[str]:
-    """The words with a command of version 0.1.0 replaced by its present name, which is said."""
-    for old, new in _RENAMED.items():
-        length = len(old.split())
-        if " ".join(words[:length]) == old:
-            print(f"splatgraft {old} is now splatgraft {new}; the next version drops the old name", file=sys.stderr)
-            return [*new.split(), *words[length:]]
-    return words
 
 
 def _group(words: list[str]) -> int:

@@ -21,8 +21,6 @@ class Status:
     def execute(self, console: Console) -> int:
         """Print one line per step."""
         flow = read_flow(self.project, self.out)
-        for line in flow.renamed_keys:
-            console.say(line)
         console.result(f"{'step':<20} {'seconds':>8} {'memory':>9}  state")
         for name, reason in reasons(flow).items():
             seconds, memory = _cost(read_record(flow.steps[name].out))

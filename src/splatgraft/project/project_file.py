@@ -53,12 +53,6 @@ TEMPLATE = """\
 """
 
 
-RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
-    "compose": {"at": "point"},
-}
-"""Keys of earlier versions by table, with their present names; understood for one version."""
-
-
 @dataclass(frozen=True)
 class ProjectFile:
     """The content of a project.toml."""
@@ -66,9 +60,7 @@ class ProjectFile:
     path: Path
     """The file, for messages and as the base of relative paths."""
     content: Mapping[str, Any]
-    """The tables as read, renamed keys under their present names; tables are known, keys not yet checked."""
-    renamed: tuple[str, ...] = ()
-    """One line per key that was found under an earlier name."""
+    """The tables as read; tables are known, keys not yet checked."""
 
     def step(self, kind: type[T], given: Mapping[str, Path] | None = None, *, out: Path, side: Side | None = None) -> T:
         """Build the step `kind` from its table, which has the class's name in lower case.
@@ -110,7 +102,7 @@ class ProjectFile:
 
 def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
     """Read project.toml; `tables` are allowed beside [source] and [target]."""
-    content, renamed = _present_names(path, read_toml(path))
+    content = read_toml(path)
     known = ("source", "target", *tables)
     for name, table in content.items():
         if name not in known:
@@ -122,21 +114,7 @@ def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
         _check_side(path, side, content.get(side, {}))
         if inner := [k for k, v in content[side].items() if isinstance(v, dict) and k != "reconstruct"]:
             raise ValueError(f"{path}: expected no table in [{side}] but [{side}.reconstruct], found {inner[0]}")
-    return ProjectFile(path, content, renamed)
-
-
-def _present_names(path: Path, content: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """The content with renamed keys under their present names, and one line per such key."""
-    present, lines = dict(content), []
-    for name, keys in RENAMED_KEYS.items():
-        table: Any = content.get(name)
-        for old, new in keys.items():
-            if isinstance(table, dict) and old in table:
-                if new in table:
-                    raise ValueError(f"{path} [{name}]: expected {new} alone, found also {old}, its earlier name")
-                present[name] = {new if key == old else key: value for key, value in present[name].items()}
-                lines.append(f"{path} [{name}]: {old} is now called {new}; the next version refuses {old}")
-    return present, tuple(lines)
+    return ProjectFile(path, content)
 
 
 def _check_side(path: Path, side: Side, table: Mapping[str, Any]) -> None:

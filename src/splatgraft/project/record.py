@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -34,8 +34,6 @@ class Job:
     """Files whose content the result depends on, by role."""
     options: Mapping[str, Any]
     """Plain JSON values that the result depends on."""
-    defaults: Mapping[str, Any] = field(default_factory=dict)
-    """Defaults of the options that have one: what an earlier version did, which did not have the option yet."""
 
     @cached_property
     def entries(self) -> Mapping[str, tuple[Entry, ...]]:
@@ -118,11 +116,9 @@ def why_stale(job: Job) -> str | None:
     if missing := [name for name in record.outputs if not (job.folder / name).is_file()]:
         return f"{missing[0]} was removed"
     options = json.loads(json.dumps(job.options))
-    # an option that came with a later version than the record's was at its default; one that has gone says nothing
-    before = {**json.loads(json.dumps(job.defaults)), **record.options}
     for key in sorted(options):
-        if options.get(key) != before.get(key):
-            text = f"{key} is now {options.get(key)}, was {before.get(key)}"
+        if options.get(key) != record.options.get(key):
+            text = f"{key} is now {options.get(key)}, was {record.options.get(key)}"
             return text if len(text) < _LONGEST_REASON else f"{key} changed"
     for role in sorted({*job.inputs, *record.inputs}):
         before = record.inputs.get(role, ())
@@ -143,7 +139,7 @@ def write_record(folder: Path, record: Record) -> None:
 
 
 def _plain(note: Note) -> dict[str, Any]:
-    """A warning in the keys of version 0.1.0, and its remedy where it has one."""
+    """Return a warning as plain JSON, with its remedy if it has one."""
     picture = None if note.picture is None else str(note.picture)
     remedy = {"remedy": note.remedy} if note.remedy else {}
     return {"text": note.text, "picture": picture, "minor": note.level == "minor", **remedy}

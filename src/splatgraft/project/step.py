@@ -5,7 +5,7 @@ import shutil
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, get_args, runtime_checkable
@@ -19,7 +19,6 @@ from splatgraft.runtime.files import atomic_folder, atomic_write, room_on_disk, 
 from splatgraft.runtime.note import Note
 from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
 from splatgraft.runtime.progress import Progress
-from splatgraft.runtime.settings import default_of
 
 if TYPE_CHECKING:
     import torch  # takes seconds; the editor's page opens before
@@ -109,14 +108,7 @@ def job_of(step: Step) -> Job:
     """Return the job of `step`; a method `recorded_options` of the step replaces its fields."""
     recorded = getattr(step, "recorded_options", None)
     options: dict[str, Any] = plain_options(vars(step)) if recorded is None else recorded()
-    defaults = {one.name: default_of(one) for one in fields(type(step))}  # pyright: ignore[reportArgumentType]
-    return Job(
-        step=type(step).__name__.lower(),
-        folder=step.out,
-        inputs=step.inputs(),
-        options=options,
-        defaults=plain_options({name: value for name, value in defaults.items() if value is not MISSING}),
-    )
+    return Job(step=type(step).__name__.lower(), folder=step.out, inputs=step.inputs(), options=options)
 
 
 def path_fields(step: Step) -> list[Path]:

@@ -43,8 +43,6 @@ class Flow:
     """Folders of the results."""
     steps: Mapping[str, Step]
     """Steps by name: the command, after source/ or target/ if both captures need it."""
-    renamed_keys: tuple[str, ...] = ()
-    """One line per key of the project file that has a new name."""
 
     def __iter__(self) -> Iterator[tuple[str, Step]]:
         return iter(self.steps.items())
@@ -88,7 +86,7 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
             made = file.step(Adopt, given | {"scene": trained}, out=layout.scene(side), side=side)
             made = replace(made, axes=capture.axes if made.axes is None else made.axes)
         steps[f"{side}/reconstruct"] = made
-    flow = Flow(layout, steps | _joint_steps(file, layout), file.renamed)
+    flow = Flow(layout, steps | _joint_steps(file, layout))
     _require_order(path, flow)
     return flow
 

@@ -28,8 +28,6 @@ def run_steps(
     capture are not plausible and this was not accepted.
     """
     flow = read_flow(project, out)
-    for line in flow.renamed_keys:
-        console.say(line)
     wanted = flow.up_to(to)
     forced = {step for name in force for step in flow.named(name)}
     root = flow.layout.root

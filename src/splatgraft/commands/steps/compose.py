@@ -1,6 +1,5 @@
 """The command `compose`: place an object in a target scene, by a given placement or on a surface with room for it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -129,11 +128,6 @@ def _size(placed: Placed, given: float | None, own: MetricScale | None, place: M
             "unknown: give it by splatgraft scale, or by --scale"
         )
     return f"size: {'; '.join([*parts, why])}"
-
-
-def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
-    """`--at` is another name of `--point`."""
-    return ["--point" if word == "--at" else word for word in words]
 
 
 COMMAND = Compose

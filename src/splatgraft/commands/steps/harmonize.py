@@ -1,7 +1,6 @@
 """The command `harmonize`: make one harmonised image of each rendered view."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +16,7 @@ from splatgraft.folders.harmonized_views import (
     picture_folders,
 )
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import HARMONIZERS, CompactOptions, EditOptions, FluxOptions, NoneOptions
+from splatgraft.harmonization import CompactOptions, EditOptions, FluxOptions, NoneOptions
 from splatgraft.project.step import Context, Device, Inputs, Positional, plain_options
 
 _WEIGHTS = ("weights", "base", "model", "lora")  # options of the methods that name weights
@@ -84,19 +83,6 @@ def _weight_files(named: Path | str) -> list[Path]:
     if path.is_dir():
         return [file for file in sorted(path.rglob("*")) if file.suffix in _WEIGHT_SUFFIXES]
     return [path] if path.is_file() or isinstance(named, Path) else []
-
-
-def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
-    """`--method NAME`, the form of version 0.1.0, becomes the sub-command NAME."""
-    words = [part for word in words for part in (word.split("=", 1) if word.startswith("--method=") else [word])]
-    if "--method" not in words[:-1]:
-        return words
-    at = words.index("--method")
-    name = words[at + 1]
-    if name not in HARMONIZERS:
-        raise ValueError(f"--method: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")
-    say(f"--method {name} is now a sub-command: splatgraft harmonize {name} VIEWS; the next version drops --method")
-    return [name, *words[:at], *words[at + 2 :]]
 
 
 COMMAND = Harmonize
