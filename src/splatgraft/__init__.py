@@ -138,13 +138,13 @@ __all__ = [
 
 @cache
 def _sources() -> dict[str, tuple[str, str]]:
-    """Module and name there of each public name: what the imports above, which never run, tell type checkers."""
+    """Return the module of each public name and its name there, read from the imports above, which never run."""
     block = next(node for node in ast.parse(Path(__file__).read_text("utf-8")).body if isinstance(node, ast.If))
     imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
     return {alias.asname or alias.name: (str(one.module), alias.name) for one in imports for alias in one.names}
 
 
-if not TYPE_CHECKING:  # a type checker would take every unknown name for one of these
+if not TYPE_CHECKING:  # otherwise a type checker would accept every unknown name
 
     def __getattr__(name: str) -> object:
         """Load a public name when it is first used (PEP 562)."""

@@ -1,4 +1,4 @@
-"""`python -m splatgraft`: the command line, where the script is not on the path."""
+"""`python -m splatgraft`: the command line, if the script is not on the path."""
 
 import sys
 

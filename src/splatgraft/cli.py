@@ -1,4 +1,4 @@
-"""The command line: the table of commands, and the call of one of them with only its own imports."""
+"""The command line: finds a command, imports only its module, and prints errors in one line."""
 
 import importlib
 import os
@@ -38,14 +38,6 @@ _TABLE = (
     ("doctor", "doctor", "say what is installed, what is missing and how to get it"),
 )
 
-_RENAMED = {
-    "evaluate benchmark": "paper benchmark",
-    "evaluate paper": "paper tables",
-    "synth": "paper synth",
-    "train": "paper train",
-}
-"""Commands of version 0.1.0 that are understood for one more version."""
-
 
 @dataclass(frozen=True)
 class Command:
@@ -54,19 +46,19 @@ class Command:
     place: str
     """MODULE or MODULE:CLASS of the dataclass of its arguments; without a class it is `COMMAND`."""
     summary: str
-    """What it does, in a few words."""
+    """Summary in the list of commands."""
 
     def load(self) -> Any:
-        """The dataclass of the command's arguments; its module is imported."""
+        """Import the command's module and return the dataclass of its arguments."""
         module, _, name = self.place.partition(":")
         return getattr(importlib.import_module(module), name or "COMMAND")
 
 
 @cache
 def commands() -> Mapping[str, Command]:
-    """All commands by name: those of this package, and those that installed packages add (entry point `ENTRY_POINTS`).
+    """Return all commands by name: those of this package and those of installed packages (entry point `ENTRY_POINTS`).
 
-    Such a package gives rows (name, MODULE:CLASS, summary), each name beginning with the entry point's.
+    An entry point names rows (name, MODULE:CLASS, summary); each name begins with the name of the entry point.
     """
     found = {name: Command(f"splatgraft.commands.{module}", summary) for name, module, summary in _TABLE}
     for entry in entry_points(group=ENTRY_POINTS):
@@ -75,8 +67,8 @@ def commands() -> Mapping[str, Command]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns 0 on success, 2 where the user's data or arguments are at fault, 130 on Ctrl-C."""
-    # torch and numba each have a pool of threads; one that spins while it waits takes the cores from the other
+    """Run one command and return its exit status: 0 for success, 2 for bad data or arguments, 130 after Ctrl-C."""
+    # torch and numba each have a pool of threads; idle threads that spin take the cores from the other pool
     # (measured on 2 busy cores: a reconstruction in 5 s instead of 80)
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     # FFmpeg inside OpenCV prints lines of its own about videos that our one line explains
@@ -110,7 +102,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    words = _present_name(words)
     table = commands()
     lengths = (length for length in range(min(3, len(words)), 0, -1) if " ".join(words[:length]) in table)
     length = next(lengths, 0)
@@ -124,9 +115,8 @@ def _dispatch(words: list[str]) -> int:
     from splatgraft.runtime.console import Console
 
     console, kind = Console(), table[command].load()
-    for place in (kind, sys.modules[table[command].place.partition(":")[0]]):
-        if hasattr(place, "current_arguments"):
-            rest = place.current_arguments(rest, console.say)
+    if hasattr(kind, "current_arguments"):
+        rest = kind.current_arguments(rest, console.say)
     options = tyro.cli(
         kind,
         prog=f"splatgraft {command}",
@@ -142,18 +132,8 @@ def _dispatch(words: list[str]) -> int:
     return 0
 
 
-def _present_name(words: list[str]) -> list[str]:
-    """The words with a command of version 0.1.0 replaced by its present name, which is said."""
-    for old, new in _RENAMED.items():
-        length = len(old.split())
-        if " ".join(words[:length]) == old:
-            print(f"splatgraft {old} is now splatgraft {new}; the next version drops the old name", file=sys.stderr)
-            return [*new.split(), *words[length:]]
-    return words
-
-
 def _group(words: list[str]) -> int:
-    """Help on the commands that begin with these words, or an error that lists them."""
+    """Print help on the commands that begin with these words, or raise a ValueError that lists them."""
     wants_help = bool(words) and words[-1] in ("-h", "--help")
     first = words[:-1] if wants_help else words
     while first and not _below(first):
@@ -174,7 +154,7 @@ def _below(first: Sequence[str]) -> dict[str, str]:
 
 
 def _first_words() -> dict[str, str]:
-    """The commands that begin with a command of one word, and a line for each group that has none."""
+    """Return the summaries of commands of one word with their sub-commands, and one line for each other group."""
     table = commands()
     alone = {name for name in table if " " not in name}
     groups = {name.split()[0] for name in table} - alone

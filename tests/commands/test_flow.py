@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,9 +23,9 @@ from splatgraft.cli import main
 from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.core.images import read_rgb, write_image
 from splatgraft.formats import read_gaussians
-from splatgraft.harmonization import HARMONIZERS, FluxOptions
-from splatgraft.project.record import read_record
-from splatgraft.project.step import FolderCheckpoint, job_of
+from splatgraft.harmonization import HARMONIZERS, CompactOptions, EditOptions, FluxOptions, HarmonizerOptions
+from splatgraft.project.record import read_record, why_stale
+from splatgraft.project.step import FolderCheckpoint, job_of, replacing
 from splatgraft.runtime.settings import choices, field_types
 from splatgraft.workflow.flow import read_flow
 
@@ -157,6 +158,33 @@ def test_every_harmoniser_is_a_sub_command_and_its_keys_stand_beside_it_in_the_t
     assert (step.method, step.processes) == (FluxOptions(weights="hub/id", lora=lora), 2)
 
 
+@pytest.mark.parametrize(
+    ("method", "file"),
+    [
+        (CompactOptions(weights="w/compact.safetensors"), "w/compact.safetensors"),
+        (CompactOptions(weights="w"), "w/compact.safetensors"),
+        (FluxOptions(weights="w", base="hub/id"), "w/transformer/diffusion_pytorch_model.safetensors"),
+        (FluxOptions(weights="hub/id", base="w"), "w/vae/diffusion_pytorch_model.safetensors"),
+        (FluxOptions(weights="hub/id", lora=Path("w/lora.safetensors")), "w/lora.safetensors"),
+        (EditOptions(model="w"), "w/unet/model.bin"),
+    ],
+)
+def test_new_weights_make_harmonised_views_stale(
+    project: Path, monkeypatch: pytest.MonkeyPatch, method: HarmonizerOptions, file: str
+) -> None:
+    monkeypatch.chdir(project.parent)
+    step = read_flow(project).steps["harmonize"]
+    assert isinstance(step, Harmonize)
+    step, weights = replace(step, method=method), Path(file)
+    weights.parent.mkdir(parents=True)
+    weights.write_bytes(b"old")
+    with replacing(job_of(step)):
+        pass
+    assert why_stale(job_of(step)) is None
+    weights.write_bytes(b"new")
+    assert why_stale(job_of(step)) == f"weights: {weights.name} changed"
+
+
 def test_views_of_a_ground_truth_that_no_step_saw_are_measured_apart(project: Path) -> None:
     truth = project.parents[1] / "photos" / "truth"
     photograph(truth, plane((0.5, 0.45, 0.6)), ball())
@@ -177,7 +205,7 @@ def test_no_masks_are_cut_from_the_images_and_the_choice_is_said(
     shutil.rmtree(project.parents[1] / "photos" / "source" / "masks")
     assert main(["run", str(project), "--to", "segment"]) == 0
     said = capsys.readouterr().err
-    assert "no masks for all images; they are cut by grabcut" in said
+    assert "not every image has a mask; masks are cut by grabcut" in said
     assert "the masks agree with the object by" in said
     folder = read_flow(project).layout.object
     assert len(list((folder / "masks").iterdir())) == 8

@@ -67,7 +67,7 @@ def test_a_method_without_noise_begins_at_renders_too_and_says_so(finished_proje
     harmonized = tmp_path / "harmonized"
     perform(Harmonize(finished_project / "views", harmonized, NoneOptions(), device="cpu"), Console())
     perform(consolidation(finished_project, harmonized, tmp_path / "out", updates=2, passes=1), Console())
-    assert "none: no noise; each of 2 updates begins at renders of the scene so far" in capsys.readouterr().err
+    assert "none: no noise levels; each of 2 updates begins at renders of the scene" in capsys.readouterr().err
 
 
 def test_views_of_an_unknown_method_cannot_be_updated(finished_project, tmp_path):

@@ -89,11 +89,11 @@ def test_a_place_is_named_by_a_pixel_or_a_point(captures: Path, capsys) -> None:
     foot = placed(captures).points(torch.tensor([0.0, 0, 0.3]))
     # a surface of discs of deviation 0.12 is this uncertain along a ray that meets it at 40 degrees
     assert (foot[:2] - torch.tensor(wanted[:2])).norm() < 0.15
-    assert composed(captures, "--scale", "0.5", "--at", "0.4", "-0.3", "0.2") == 0
+    assert composed(captures, "--scale", "0.5", "--point", "0.4", "-0.3", "0.2") == 0
     foot = placed(captures).points(torch.tensor([0.0, 0, 0.3]))
     assert (foot[:2] - torch.tensor(wanted[:2])).norm() < 0.1
     for words, message in (
-        (("--on", "view_0001.png:1,2", "--at", "0", "0", "0"), "expected --point or --on, found both"),
+        (("--on", "view_0001.png:1,2", "--point", "0", "0", "0"), "expected --point or --on, found both"),
         (("--on", "nowhere.png:1,2"), "--on: expected one picture called nowhere.png, found 0 of 8"),
         (("--on", "1,2"), "--on: expected"),
     ):

@@ -54,16 +54,11 @@ def images(folder) -> list[bytes]:
     return [path.read_bytes() for path in sorted((folder / "images").iterdir())]
 
 
-def test_the_method_is_a_sub_command_and_its_old_form_as_an_option_is_understood(views, tmp_path, capsys, monkeypatch):
+def test_the_method_is_a_sub_command(views, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["harmonize", str(views), "--method", "compact", "--out", "old"]) == 0
-    assert "--method compact is now a sub-command: splatgraft harmonize compact VIEWS" in capsys.readouterr().err
     assert main(["harmonize", "compact", str(views), "--out", "new"]) == 0
-    assert images(tmp_path / "old") == images(tmp_path / "new")
     assert [read_rgb(path).shape for path in sorted((tmp_path / "new" / "images").iterdir())][2] == (16, 32, 3)
     assert len(list((tmp_path / "new" / "confidence").iterdir())) == 4
-    assert main(["harmonize", str(views), "--method=magic"]) == 2
-    assert "--method: expected one of compact, edit, flux" in capsys.readouterr().err
     assert main(["harmonize", "compact", str(views), "--strength", "2"]) == 2
     assert "--strength: expected a number from 0 to 1, found 2.0" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""project.toml: every key that a template offers is understood, and renamed keys are understood with a remark."""
+"""project.toml: every key that a template offers is understood."""
 
 import re
 import tomllib
@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from splatgraft.cli import main
-from splatgraft.commands.steps.compose import Compose
 from splatgraft.project.project_file import TEMPLATE
 from splatgraft.workflow.flow import STEPS, read_flow
 from splatgraft.workflow.project_reference import full_project_text, project_keys
@@ -95,22 +94,6 @@ def test_every_table_and_key_is_described() -> None:
     assert "sampling_steps" in [key.name for key in flux.keys]
     unexplained = [f"{t.name} {k.name}" for t in tables.values() for k in t.keys if not k.meaning]
     assert not unexplained
-
-
-def test_a_renamed_key_is_understood_with_a_line_that_says_the_new_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    text = "".join(f"[{side}]\n{line}\n" for side, line in SIDES.items())
-    path = tmp_path / "project.toml"
-    path.write_text(f"{text}[compose]\nat = [1, 2, 3]\n")
-    compose = read_flow(path).steps["compose"]
-    assert isinstance(compose, Compose)
-    assert compose.options.point == (1.0, 2.0, 3.0)
-    assert main(["run", str(path)]) == 2  # capture a does not exist
-    assert "project.toml [compose]: at is now called point" in capsys.readouterr().err.splitlines()[0]
-    path.write_text(f"{text}[compose]\nat = [1, 2, 3]\npoint = [1, 2, 3]\n")
-    with pytest.raises(ValueError, match=r"\[compose\]: expected point alone, found also at"):
-        read_flow(path)
 
 
 def test_init_full_writes_a_project_with_every_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,8 +1,13 @@
 """Atomic files: replaced when complete, unchanged after an error or a kill."""
 
+import errno
+import os
+from types import SimpleNamespace
+
 import pytest
 from killing import Killed, killed_at_write
 
+from splatgraft.runtime import files
 from splatgraft.runtime.files import atomic_write
 
 
@@ -49,3 +54,33 @@ def test_where_nothing_can_be_written(tmp_path):
         pass
     with pytest.raises(ValueError, match="expected a file name to write, found a folder"), atomic_write(tmp_path):
         pass
+
+
+def test_a_folder_is_replaced_on_windows(tmp_path, monkeypatch):
+    """Windows opens no folders, and flushes only files that are open for writing."""
+    opened: dict[int, int] = {}
+
+    def open_as_windows(path, flags):
+        if os.path.isdir(path):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        descriptor = os.open(path, flags)
+        opened[descriptor] = flags
+        return descriptor
+
+    def flush_as_windows(descriptor):
+        if not opened[descriptor] & os.O_RDWR:
+            raise OSError(errno.EBADF, "Bad file descriptor")
+        flushed.append(descriptor)
+
+    flushed: list[int] = []
+    with monkeypatch.context() as windows:
+        windows.setattr(files, "sys", SimpleNamespace(platform="win32"))
+        own = {"open": open_as_windows, "fsync": flush_as_windows}
+        windows.setattr(files, "os", SimpleNamespace(**{**vars(os), **own}))
+        for text in ("first", "second"):
+            with files.atomic_folder(tmp_path / "result") as folder:
+                (folder / "inner").mkdir()
+                (folder / "inner" / "a.txt").write_text(text)
+    assert (tmp_path / "result" / "inner" / "a.txt").read_text() == "second"
+    assert len(flushed) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]

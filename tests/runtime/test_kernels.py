@@ -57,3 +57,44 @@ def test_an_edit_of_an_inlined_kernel_is_seen(tmp_path, read_only):
     assert results == ("11", "11", "21")
     assert from_cache == ("0", "1", "0")
     assert of_numba_alone == ("11", "11", "11")
+
+
+LAYERS = """
+import importlib.util, sys
+from numba.np.ufunc import omppool, parallel
+parallel._check_tbb_version_compatible = lambda: None
+sys.modules["numba.np.ufunc.tbbpool"] = omppool
+for name in sys.argv[1:]:
+    sys.modules[f"numba.np.ufunc.{name}"] = None
+    delattr(sys.modules["numba.np.ufunc"], name)
+from splatgraft.runtime.kernels import threading_layer
+print(threading_layer())
+"""
+
+
+@pytest.mark.parametrize(("absent", "layer"), [((), "omp"), (("omppool",), "workqueue")])
+def test_tbb_is_not_used_where_it_is_installed(absent, layer):
+    """An installed TBB is simulated: numba would take it first."""
+    pytest.importorskip("numba.np.ufunc.omppool")
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_THREADING_LAYER"}
+    program = [sys.executable, "-c", LAYERS, *absent]
+    assert subprocess.check_output(program, env=environment, text=True).split() == [layer]
+
+
+@pytest.mark.parametrize("layer", ["omp", "workqueue"])
+def test_kernels_run_on_the_layer_that_the_user_names(layer):
+    program = (
+        "import numpy as np, numba\n"
+        "from splatgraft.runtime.kernels import threading_layer\n"
+        "@numba.njit(parallel=True)\n"
+        "def double(x):\n"
+        "    for i in numba.prange(len(x)):\n"
+        "        x[i] *= 2\n"
+        "    return x\n"
+        "print(int(double(np.ones(100)).sum()), threading_layer())"
+    )
+    environment = {**os.environ, "NUMBA_THREADING_LAYER": layer}
+    assert subprocess.check_output([sys.executable, "-c", program], env=environment, text=True).split() == [
+        "200",
+        layer,
+    ]

@@ -1,4 +1,4 @@
-"""The command `check`: a look at the photos of a capture before time is spent on them."""
+"""The command `check`: a quick test of a capture's photos before a long run."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -31,14 +31,14 @@ from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.segmentation import WIDE_GAP_DEG, widest_gap
 
-_FRAMES = 40  # frames of a video that are looked at; the command `capture` takes 120
-_DRAFT_SECONDS = 45.0  # for a draft of any size; two idle cores
-_FOCAL_LENGTH = 0x920A
+_FRAMES = 40  # frames examined in a video; the command `capture` takes 120
+_DRAFT_SECONDS = 45.0  # to a draft of any size on two idle cores
+_FOCAL_LENGTH = 0x920A  # EXIF tag
 
 
 @dataclass(frozen=True)
 class Check:
-    """Look at a capture in seconds, before time is spent on it. Exit status: 0 usable, 1 not usable as it is."""
+    """Examine a capture in seconds, before a long run. Exit status: 0 usable, 1 not usable."""
 
     capture: Positional
     """A folder or a .zip of photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene."""
@@ -101,50 +101,50 @@ class Check:
     def _of_video(self, console: Console) -> Iterator[Finding]:
         frames = grey_frames(self.capture, _FRAMES, SIDE_PX)
         names = [f"frame {i + 1} of {len(frames)}" for i in range(len(frames))]
-        yield Finding("video", "good", f"{len(frames)} frames spread over it were looked at")
+        yield Finding("video", "good", f"{len(frames)} frames spread over it were examined")
         with console.bar("check") as progress:
-            # frames that lie three times as far apart as those that `capture` takes need not overlap
+            # these frames are three times as far apart as those of `capture`, so they need not overlap
             yield from find_in_photos(frames, names, has_poses=True, progress=progress)
         yield _masks(0)
         yield _time(3 * len(frames))
 
 
 _VERDICTS = {
-    "unusable": "not usable as it is; mend what is marked unusable first",
+    "unusable": "not usable; mend the points marked unusable first",
     "doubtful": "usable, but the doubtful points above may cost quality",
     "good": "good to go",
 }
-"""By the worst level of all findings."""
+"""Verdict by the worst level of all findings."""
 
 
 def _lens(photos: Sequence[Path]) -> Finding:
     known = sum(_FOCAL_LENGTH in read_exif(photo) for photo in photos)
-    estimated = "all photos" if known == len(photos) else f"{known} of {len(photos)} photos: else it is estimated"
+    estimated = "all photos" if known == len(photos) else f"{known} of {len(photos)} photos; estimated for the others"
     return Finding("lens", "good", f"focal length in EXIF of {estimated}")
 
 
 def _coverage(cameras: Cameras) -> Finding:
-    """How far round the photos go about what they look at."""
+    """Measure how much of the circle around their common focus point the photos cover."""
     try:
         gap, (first, last) = widest_gap(cameras, focus_point(cameras))
-    except ValueError:  # they look outwards
-        return Finding("coverage", "good", "the photos look all ways: a place, no object to cut out")
-    text = f"the photos go {360 - gap:.0f} of 360 degrees round what they look at"
+    except ValueError:  # no common focus point
+        return Finding("coverage", "good", "the photos look outwards: a place, without an object to cut out")
+    text = f"the photos cover {360 - gap:.0f} of 360 degrees around their subject"
     if gap < WIDE_GAP_DEG:
         return Finding("coverage", "good", text)
-    remedy = "photograph an object from there too, as its back is guessed else; a place need not be seen from there"
+    remedy = "photograph an object from there, too, or its back is guessed; a place needs no such photos"
     return Finding("coverage", "good" if gap < 180 else "doubtful", f"{text}, none between {first} and {last}", remedy)
 
 
 def _masks(count: int) -> Finding:
-    text = f"{count} masks" if count else "none; a place needs none, an object is then cut out by a box or clicks"
+    text = f"{count} masks" if count else "none; a place needs none, and an object is cut out by a box or clicks"
     return Finding("masks", "good", text)
 
 
 def _time(photos_to_pose: int) -> Finding:
     posing = predict_pose_seconds(photos_to_pose)
     minutes = (posing + _DRAFT_SECONDS) / 60
-    poses = f", of which poses take {_minutes(posing / 60)}" if photos_to_pose else ""
+    poses = f", including {_minutes(posing / 60)} for the poses" if photos_to_pose else ""
     return Finding("time", "good", f"about {_minutes(minutes)} to a draft on two idle cores{poses}")
 
 

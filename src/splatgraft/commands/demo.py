@@ -11,10 +11,10 @@ from splatgraft.runtime.files import atomic_write
 from splatgraft.workflow.run import run_steps
 
 CAPTURES_FOLDER = "captures"
-"""Folder of the two captures in the demo's folder."""
+"""Folder of the two captures, inside the demo's folder."""
 
 _PROJECT = """\
-# What `splatgraft demo` runs: photographed bananas are moved onto a rendered kitchen table.
+# The project of `splatgraft demo`: photographed bananas are moved onto a rendered kitchen table.
 
 [source]
 capture = "captures/bananas"
@@ -44,16 +44,16 @@ class Demo:
     cores, nothing is downloaded."""
 
     folder: Positional = Path("splatgraft_demo")
-    """Folder of the project, made where it does not exist; 150 MB when the demo is done."""
+    """Folder of the project, made if it does not exist; 150 MB at the end of the demo."""
     width: int = 1280
     """Width of the report's pictures, pixels."""
     iterations: int = 2000
-    """Training steps of the table; the bananas' scene, whose object is fitted again, has half as many."""
+    """Training steps of the table; the bananas take half, because the object is fitted again."""
     budget: int = 30_000
-    """Most Gaussians of each scene."""
+    """Maximum number of Gaussians of each scene."""
 
     def execute(self, console: Console) -> int:
-        """Write the project and run it; what an earlier, killed demo has done is not done again."""
+        """Write the project and run it; finished steps of an earlier, killed demo are kept."""
         project = self.folder / PROJECT_FILE
         lengths = {"iterations": self.iterations, "source_iterations": max(1, self.iterations // 2)}
         text = _PROJECT.format(**lengths, budget=self.budget, width=self.width)
@@ -69,7 +69,7 @@ class Demo:
 
 
 def copy_captures(folder: Path) -> None:
-    """Copy the captures that come with the package to `folder`; files that are there are kept."""
+    """Copy the captures that come with the package to `folder`; existing files are kept."""
     with as_file(files("splatgraft") / "demo_captures") as shipped:
         for source in shipped.rglob("*"):
             target = folder / source.relative_to(shipped)

@@ -1,4 +1,4 @@
-"""The command `doctor`: what is installed, what is missing, and the command that installs it."""
+"""The command `doctor`: installed and missing packages, with the command that installs each."""
 
 import os
 import platform
@@ -9,12 +9,13 @@ from importlib.metadata import PackageNotFoundError, version
 import torch
 
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.kernels import threading_layer
 from splatgraft.runtime.optional_dependencies import OPTIONAL_DEPENDENCIES
 
 
 @dataclass(frozen=True)
 class Doctor:
-    """Say what is installed, what is missing and how to install it."""
+    """List installed and missing packages, and how to install the missing ones."""
 
     def execute(self, console: Console) -> int:
         """Print one line per item; a missing optional dependency is no error."""
@@ -22,7 +23,7 @@ class Doctor:
             ("splatgraft", version("splatgraft")),
             ("python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
             ("torch", f"{torch.__version__}, {torch.get_num_threads()} threads"),
-            ("numba", version("numba")),
+            ("numba", f"{version('numba')}, threads by {threading_layer()}"),
             ("processor", f"{_cores()} cores"),
             ("memory", _memory()),
             ("disk", f"{shutil.disk_usage('.').free / 2**30:.0f} GiB free here"),

@@ -24,17 +24,17 @@ class Edit:
     project: Annotated[Path, tyro.conf.Positional] = Path(PROJECT_FILE)
     """The project file or its folder, which need not exist."""
     out: Path | None = None
-    """Folder of all results; the folder of the project file where not given."""
+    """Folder of all results; the folder of the project file if not given."""
     port: int = 8080
-    """Port to listen at, on this machine only; the next free one where it is taken."""
+    """Port to listen at, on this machine only; the next free one if it is taken."""
     keep_closed: bool = False
-    """Only print the address, where there is a desktop to open it on."""
+    """Print the address without opening it in the browser."""
     budget: int = 300_000
-    """Most Gaussians of a scene that are drawn while the view moves; resting pictures and files have all."""
+    """Maximum number of Gaussians drawn while the view moves; still pictures and files have all."""
 
     def execute(self, console: Console) -> int:
         """Serve until Ctrl-C."""
-        # before the page is served: an interruption while torch is loaded ends the editor as one later does
+        # set before the page is served, so that Ctrl-C ends the editor cleanly even while torch is being loaded
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
@@ -42,7 +42,7 @@ class Edit:
         end_process(0)
 
     def serve(self, console: Console, stop: threading.Event) -> None:
-        """Serve until `stop` is set; a ValueError where another editor has the project open."""
+        """Serve until `stop` is set; raises ValueError if another editor has the project open."""
         from splatgraft.editor.page.opening import Opening
         from splatgraft.editor.page.server import GuardedServer
 

@@ -26,20 +26,20 @@ class Export:
     """The file to write; its suffix names the format: .html (one page with a viewer), .sog, .spz, .compressed.ply,
     .ply, .splat, .glb; .png or .jpg (the page's first view); .mp4, .gif or .webp (a turntable)."""
     page: Literal["viewer", "report"] = "viewer"
-    """What an .html holds: the scene with a viewer, or the project's report with all its pictures."""
+    """Content of an .html: the scene with a viewer, or the project's report with all its pictures."""
     cameras: Path | None = None
-    """The capture that a scene was made from: says which way is up and where to look from. Found in a project."""
+    """The capture that a scene was made from; gives the up direction and the first view. Found in a project."""
     title: str | None = None
-    """What a page calls the scene; the name of its file or folder where not given."""
+    """Title of the page; the name of the scene's file or folder if not given."""
     options: ExportOptions = field(default_factory=ExportOptions)
 
     @property
     def folder(self) -> Path:
-        """The scene's folder or file; the project's folder where its project.toml was named."""
+        """The scene's folder or file; the project's folder if its project.toml was given."""
         return self.scene.parent if self.scene.name == PROJECT_FILE else self.scene
 
     def execute(self, console: Console) -> int:
-        """Read, write, and say what was assumed, how large the file is and how long it took."""
+        """Write the file and print the assumptions, its size and the time."""
         self._say_stale(console)
         for sentence in self.write(console):
             console.say(sentence)
@@ -47,7 +47,7 @@ class Export:
         return 0
 
     def write(self, console: Console) -> tuple[str, ...]:
-        """Read and write, with a progress bar; gives sentences: what was assumed, size and seconds."""
+        """Write the file with a progress bar; returns sentences with the assumptions, size and seconds."""
         began, said = time.monotonic(), ()
         if self.page == "report":
             write_report_file(self.to, self._report())
@@ -60,7 +60,7 @@ class Export:
         return (*(f"{self.to}: {sentence}" for sentence in said), f"{self.to}: {size:.1f} MB in {seconds:.1f} s")
 
     def _report(self) -> Path:
-        """The report's page: of the project, or of its folder report."""
+        """Return the report's page, for a project or for its folder report."""
         if self.to.suffix.lower() != ".html":
             raise ValueError(f"--page report: expected a file that ends in .html, found {self.to.name}")
         own = self.folder / REPORT_FILE
@@ -72,9 +72,9 @@ class Export:
             return
         try:
             stale = [name for name in stale_steps(root) if self.page == "report" or name != "evaluate"]
-        except ValueError as error:  # the results are there, whatever became of the photos
+        except ValueError as error:  # results can be exported even if the photos are gone
             console.tell(
-                Note(f"{root}: expected to know whether the result is up to date, found that {error}", "warning")
+                Note(f"{root}: the result may be out of date, because an input cannot be read: {error}", "warning")
             )
             return
         if stale:

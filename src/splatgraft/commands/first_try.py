@@ -1,4 +1,4 @@
-"""The command `try`: the whole flow on two captures of one's own, with nothing to decide first: a draft, then finer."""
+"""The command `try`: the whole flow on two captures without earlier decisions, as a draft and then finer."""
 
 import re
 import shlex
@@ -22,15 +22,15 @@ from splatgraft.workflow.flow import Flow, read_flow
 from splatgraft.workflow.run import run_steps
 
 DRAFT = {"quality": "draft"}
-"""Keys of [reconstruct] of a first try."""
-_FINER = {"draft": "standard", "standard": "high"}  # the quality after each
+"""Keys of [reconstruct] for the draft."""
+_FINER = {"draft": "standard", "standard": "high"}  # the next finer quality
 
 
 @dataclass(frozen=True)
 class Try:
-    """Run the whole flow on two captures with nothing to decide first: a draft, whose report opens, then again with
-    the place at standard quality, which replaces it. The same command goes on after an interruption. Poses that are not
-    plausible are used and said to be so."""
+    """Run the whole flow on two captures: first a draft, whose report opens, then again with the place at standard
+    quality, which replaces the draft. The same command continues after an interruption. Poses that are not plausible
+    are used, with a warning."""
 
     object: Positional
     """The capture with the object: photos (a folder or a .zip), a video, a COLMAP folder, a folder with
@@ -38,14 +38,14 @@ class Try:
     place: Positional
     """The capture or the scene that receives it."""
     out: Path | None = None
-    """Folder of the project; where not given, OBJECT_into_PLACE here, or with a number where that is taken."""
+    """Folder of the project; if not given, OBJECT_into_PLACE here, with a number if that name is taken."""
     draft: bool = False
     """Stop at the draft."""
     keep_closed: bool = False
-    """Only print the report's path, where there is a desktop to open it on."""
+    """Print the report's path without opening it in the browser."""
 
     def execute(self, console: Console) -> int:
-        """Write the project, run it, and say what was unsure and what helps."""
+        """Write the project, run it, and print the doubts about its result with remedies."""
         folder = self.out or self._free_folder()
         self._write_project(folder, console)
         project = folder / PROJECT_FILE
@@ -63,7 +63,7 @@ class Try:
         return 0
 
     def _free_folder(self) -> Path:
-        """OBJECT_into_PLACE: the folder of an earlier try of these captures, or one that does not exist yet."""
+        """Return the folder of an earlier try of these captures, or else a new OBJECT_into_PLACE."""
         name = f"{_name(self.object)}_into_{_name(self.place)}"
         for folder in (Path(name if i == 1 else f"{name}_{i}") for i in count(1)):
             project = folder / PROJECT_FILE
@@ -73,13 +73,13 @@ class Try:
         raise AssertionError
 
     def _write_project(self, folder: Path, console: Console) -> None:
-        """A project at draft quality; one that this command wrote earlier, and that may be finer now, is kept."""
+        """Write a project at draft quality; an earlier one of these captures is kept, because it may be finer now."""
         project = folder / PROJECT_FILE
         init = Init(folder, source=self.object, target=self.place)
         if project.is_file():
             if not _same_captures(project, init.sides()):
                 raise ValueError(f"{project}: expected a project of these captures, found others; name --out FOLDER")
-            console.say(f"{project}: goes on with what is there")
+            console.say(f"{project}: continues with the existing results")
             return
         for capture in (self.object, self.place):
             found = describe_input(capture)
@@ -96,7 +96,7 @@ class Try:
 
 
 def refinements(flow: Flow, folder: Path) -> list[str]:
-    """What was unsure in a finished project, step by step, what helps most, and how to get finer results."""
+    """List the doubts about each step of a finished project, the best remedy, and how to get finer results."""
     shown = Path(shlex.quote(str(folder)))
     lines: list[str] = []
     helps: list[str] = []
@@ -113,9 +113,9 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
         lines.append(f"unsure: {name}: {doubts[0]}{_more(doubts)}")
         remedies = [note.remedy for note in record.warnings if note.in_doubt and note.remedy]
         helps += remedies[:1] or [DEFAULT_REMEDIES.get(record.step, "")]
-    # later steps build on earlier ones: the first that was unsure is the one to mend
+    # later steps build on earlier ones, so the first doubt is the one to mend
     if not any(line.startswith("unsure: ") for line in lines):
-        lines.append("no step warned of its result: look at the pictures; a cut that is off is what people mend most")
+        lines.append("no step warned of its result: look at the pictures; the cut of the object is mended most often")
         helps = [DEFAULT_REMEDIES["segment"]]
     lines.append(f"helps most: {next(filter(None, helps), '').replace('PROJECT', str(shown))}")
     quality = _FINER.get(_quality(folder / PROJECT_FILE) or "")
@@ -124,7 +124,7 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
 
 
 def _quality(project: Path) -> str | None:
-    """Of the place's reconstruction; None where the file does not say, or the place is a trained scene."""
+    """Return the quality of the place's reconstruction; None if not given, or if the place is a trained scene."""
     content = read_toml(project)
     return None if "scene" in content["target"] else content.get("reconstruct", {}).get("quality")
 
@@ -134,16 +134,16 @@ def _more(sentences: list[str]) -> str:
 
 
 def _guesses(step: Step) -> list[str]:
-    """What a step had to guess because nothing was asked."""
+    """List the guesses of a step that the user gave no masks or clicks."""
     if not isinstance(step, Segment):
         return []
     if (step.out / "masks").is_dir() and step.box is None and step.prompts is None:
-        return ["no masks and no clicks were given: the object is what stands where the cameras look."]
-    return ["the object is all that lies in a box; masks cut it finer."] if step.mask_source == "box" else []
+        return ["no masks and no clicks were given: the object is assumed to stand where the cameras look."]
+    return ["the object is everything inside a box; masks cut it more precisely."] if step.mask_source == "box" else []
 
 
 def _name(capture: Path) -> str:
-    """A short name for folders: `photos/vase/images` is vase."""
+    """Make a short name for folders: `photos/vase/images` gives vase."""
     path = capture.resolve()
     path = path.parent if path.name in ("images", "photos", "transforms.json") else path
     return re.sub(r"[^\w.-]+", "_", path.stem if path.is_file() else path.name)

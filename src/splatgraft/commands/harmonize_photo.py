@@ -1,4 +1,4 @@
-"""The command `harmonize photo`: one composite picture and its mask, without any scene."""
+"""The command `harmonize photo`: harmonise one composite picture by its mask, without a scene."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,22 +15,22 @@ from splatgraft.runtime.console import Console
 
 @dataclass(frozen=True)
 class HarmonizePhoto:
-    """Make the light of one picture agree, into which an object was pasted."""
+    """Make the light of an object agree with the picture that it was pasted into."""
 
     composite: Positional
     """The picture with the object pasted in."""
     mask: Positional
-    """Its mask: white where the object is."""
+    """Mask of the picture, white on the object."""
     out: Path = Path("harmonized.png")
     """The picture to write."""
     background: Path | None = None
-    """The picture without the object, for a model that takes it in place of the mask."""
+    """The picture without the object, for models that take it instead of the mask."""
     method: Annotated[FluxOptions, subcommand("flux")] | Annotated[EditOptions, subcommand("edit")] = field(
         default_factory=FluxOptions
     )
     """The image model."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
     def execute(self, console: Console) -> int:
         """Write the picture."""

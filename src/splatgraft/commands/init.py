@@ -21,7 +21,7 @@ class Init:
     """Write a commented project.toml."""
 
     folder: Positional
-    """The project's folder; made where it does not exist."""
+    """The project's folder; made if it does not exist."""
     source: Path
     """The capture with the object: photos (a folder or a .zip), a video, a COLMAP folder or a folder with
     transforms.json; or a trained scene (.ply, .spz, .splat, .sog, .glb, .ksplat) without photographs."""
@@ -43,7 +43,7 @@ class Init:
         return 0
 
     def text(self) -> str:
-        """The content of project.toml; a ValueError where a capture does not exist."""
+        """Return the content of project.toml; raises ValueError if a capture does not exist."""
         for capture in (self.source, self.target):
             require_input(capture)
         source, target = self.sides()
@@ -52,12 +52,12 @@ class Init:
         else:
             text = TEMPLATE.replace("{source}", source).replace("{target}", target)
         if is_scene(self.source):
-            # without photographs there are no masks: only a box tells where the object is
+            # pictures made of a trained scene have no masks
             text = with_keys(text, "segment", {"mask_source": "grabcut"})
         return text
 
     def sides(self) -> tuple[str, str]:
-        """The lines that name the captures of [source] and [target]."""
+        """Return the lines that name the captures of [source] and [target]."""
         return self._key(self.source), self._key(self.target)
 
     def _key(self, capture: Path) -> str:

@@ -30,19 +30,18 @@ from splatgraft.runtime.files import atomic_write
 from splatgraft.workflow.flow import read_flow
 
 _RADIUS = 1 / 8
-"""Of the median distance of the cameras: the radius of a place without an object. All of the region that the cameras
-look at is then evidence, which reaches 8 radii at most."""
-_MIN_HEIGHT, _MAX_HEIGHT = 16, 4096
-"""Pixels of a panorama."""
+"""Radius of a place without an object, over the cameras' median distance. Evidence is taken within 8 radii, which then
+covers the whole region that the cameras look at."""
+_MIN_HEIGHT, _MAX_HEIGHT = 16, 4096  # rows of the map
 _BLENDER_FROM_DOWN_Y = torch.tensor([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
-"""From a capture whose up is -y to what Blender makes of the .glb that `export` writes of it."""
+"""Rotation from the axes of a capture whose up is -y to those of Blender after it opened the exported .glb."""
 
 
 @dataclass(frozen=True)
 class LightAt:
-    """Write the light at a place of a target, to light meshes of other programs with: an environment map (.hdr) of the
-    ambient light, with what the scene itself shows, and beside it a .json with the lamps (sun, windows, lamps). The map
-    is without the lamps: use both, nothing is in them twice.
+    """Write the light at a place of a target, to light meshes in other programs: an environment map (.hdr) of the
+    ambient light and the scene's own radiance, and beside it a .json with the lamps (sun, windows, lamps). Use both:
+    the map is without the lamps, so nothing is counted twice.
 
     The map is equirectangular, as Blender's World expects it: the top row is +z, the middle column +x, columns to the
     right turn towards -y. It holds linear Rec. 709 radiance in the units of the capture, in which a white sky has 1;
@@ -50,28 +49,27 @@ class LightAt:
     the place to the lamp, distances are in units of the capture."""
 
     target: Positional
-    """A project (its folder or project.toml), whose target it is; or a scene file, or a folder with scene.ply, with
-    its --cameras."""
+    """A project (its folder or project.toml); or a scene file or a folder with scene.ply, together with --cameras."""
     out: Path = Path("light.hdr")
     """The environment map; the lamps are written beside it, with the suffix .json."""
     at: tuple[float, float, float] | None = None
-    """The place, x y z in the axes and units of the target's capture; where not given, the middle of the placed
-    objects."""
+    """The place, x y z in the axes and units of the target's capture; the middle of the placed objects if not
+    given."""
     radius: float | None = None
-    """Half the width of what will stand there, units of the capture: what is nearer than half of it is left out. The
-    objects' own, or an eighth of the cameras' distance."""
+    """Half the width of the thing that will stand there, units of the capture; surfaces nearer than half of it are left
+    out. If not given, that of the placed objects, or with --at an eighth of the cameras' distance."""
     cameras: Path | None = None
     """The target's cameras, a capture folder or its transforms.json; found in a project."""
     placement: Path | None = None
-    """placement.json, whose objects stand at the place and whose erased Gaussians are left out; found in a project."""
+    """placement.json: its objects give the place, and its erased Gaussians are left out. Found in a project."""
     frame: Literal["world", "capture"] = "world"
-    """Axes of the map and of the lamps. world: z is up, as in Blender after it opened the .glb that `export` writes;
-    capture: those of the target's .ply."""
+    """Axes of the map and of the lamps. world: z is up, as in Blender after it opened the exported .glb. capture: those
+    of the target's .ply."""
     height: int = 512
     """Rows of the map, which is twice as wide."""
 
     def execute(self, console: Console) -> int:
-        """Estimate, and write both files; their paths are printed."""
+        """Estimate the light, write both files and print their paths."""
         if self.out.suffix.lower() != ".hdr":
             raise ValueError(f"--out: expected a file that ends in .hdr, found {self.out.name}")
         if not _MIN_HEIGHT <= self.height <= _MAX_HEIGHT:
@@ -100,7 +98,7 @@ class LightAt:
         return 0
 
     def _step(self) -> Relight:
-        """The step that would relight the target: which files it reads, and which light it is given."""
+        """Return the step that would relight the target, for its input files and its given light."""
         root = self.target.parent if self.target.name == PROJECT_FILE else self.target
         if (root / PROJECT_FILE).is_file():
             step = read_flow(root).steps["relight"]
@@ -131,7 +129,7 @@ class LightAt:
 
 
 def _scene_of(step: Relight) -> tuple[Gaussians, list[BoundingSphere]]:
-    """The target without what is erased, and the spheres of the objects that are placed in it."""
+    """Return the target without erased Gaussians, and the bounding spheres of its placed objects."""
     if not step.placement.is_file():
         return read_gaussians(step.target), []
     composite = read_composite(step.target, step.placement)
@@ -142,9 +140,9 @@ def _scene_of(step: Relight) -> tuple[Gaussians, list[BoundingSphere]]:
 def _light_at(
     step: Relight, scene: Gaussians, cameras: Cameras, place: BoundingSphere, directions: Float[Tensor, "h w 3"]
 ) -> tuple[Light, Float[Tensor, "h w 3"]]:
-    """The light as `relight` takes it, and the radiance from `directions` without its sources.
+    """Return the light that `relight` would use, and the radiance from `directions` without the light's sources.
 
-    Of a light that was given all is known that there is: its own ambient light is the radiance.
+    If the light was given, its ambient light is the radiance.
     """
     given = step.given()
     if given is not None:

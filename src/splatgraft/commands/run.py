@@ -15,13 +15,13 @@ class Run:
     project: Positional = Path("project.toml")
     """The project file, or its folder."""
     out: Path | None = None
-    """Where all results go; the folder of the project file where not given."""
+    """Folder of all results; the folder of the project file if not given."""
     to: str | None = None
     """Stop after this step (reconstruct, or source/reconstruct for one of the two)."""
     force: tuple[str, ...] = ()
-    """Perform these steps even where they are up to date."""
+    """Perform these steps even if they are up to date."""
     accept_doubtful: bool = False
-    """Go on after a capture whose poses are not plausible, as accept_doubtful = true in [source] or [target] does."""
+    """Continue after a capture whose poses are not plausible, like accept_doubtful = true in [source] or [target]."""
 
     def execute(self, console: Console) -> int:
         """Perform the steps; the paths of the results are the last lines of standard output."""

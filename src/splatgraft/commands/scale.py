@@ -14,24 +14,24 @@ from splatgraft.runtime.lazy_sequence import LazySequence
 
 @dataclass(frozen=True)
 class Scale:
-    """Say how large a capture is, by a known length, a marker or a factor; `compose` then gives the object its size."""
+    """Set how large a capture is, by a known length, a marker or a factor; `compose` then gives the object its size."""
 
     capture: Positional
     """A folder with transforms.json or a COLMAP folder; of a project: source/capture or target/capture."""
     factor: float | None = None
-    """Metres in one world unit; 1 for poses in metres, as of ARKit."""
+    """Metres in one world unit; 1 for poses in metres, such as those of ARKit."""
     length: float | None = None
     """A known length in metres, between the two points of --ends."""
     ends: tuple[str, str] | None = None
     """Two points, each "IMAGE:X,Y IMAGE:X,Y" (pixels of the same point in two or more images), "IMAGE:X,Y" with
     --scene, or "X,Y,Z" in world units."""
     scene: Path | None = None
-    """The reconstruction, a .ply: on its surface lies a point that is given in one image alone."""
+    """The reconstruction, a .ply; points given in only one image are placed on its surface."""
     marker: float | None = None
-    """Side in metres of an AprilTag or ArUco marker (its black square) that two images or more show."""
+    """Side in metres of an AprilTag or ArUco marker (its black square), visible in two or more images."""
 
     def execute(self, console: Console) -> int:
-        """Find the scale, say it and store it."""
+        """Find the scale, print it and store it."""
         found = self._found(console)
         path = write_scale(self.capture, found)
         console.say(f"{self.capture}: one unit is {found.metres_per_unit:.4g} m, by {found.source}")

@@ -16,13 +16,11 @@ class Status:
     project: Positional = Path("project.toml")
     """The project file, or its folder."""
     out: Path | None = None
-    """Where the results are; the folder of the project file where not given."""
+    """Folder of all results; the folder of the project file if not given."""
 
     def execute(self, console: Console) -> int:
         """Print one line per step."""
         flow = read_flow(self.project, self.out)
-        for line in flow.renamed_keys:
-            console.say(line)
         console.result(f"{'step':<20} {'seconds':>8} {'memory':>9}  state")
         for name, reason in reasons(flow).items():
             seconds, memory = _cost(read_record(flow.steps[name].out))
@@ -31,7 +29,7 @@ class Status:
 
 
 def _cost(record: Record | None) -> tuple[str, str]:
-    return (f"{record.seconds:.1f}", f"{record.peak_memory_bytes / 2**30:.2f} GiB") if record else ("", "")
+    return (f"{record.seconds:.1f}", record.memory) if record else ("", "")
 
 
 COMMAND = Status

@@ -40,7 +40,7 @@ RESULTS_IN_ORDER = (
     "result",
     "report",
 )
-"""All folders of a project, relative to its root, in the order in which they are made."""
+"""All folders of a project, relative to its root, in the order of their making."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Layout:
     """The folders of one project, in the order of the flow."""
 
     root: Path
-    """Where all results go: the folder of project.toml by default."""
+    """Root folder of all results, by default the folder of project.toml."""
 
     def capture(self, side: Side) -> Path:
         """Posed images: transforms.json, points.ply."""
@@ -60,7 +60,7 @@ class Layout:
 
     @property
     def object(self) -> Path:
-        """The object alone, and which Gaussians of the source it is."""
+        """The object alone, and the indices of its Gaussians in the source."""
         return self.root / "object"
 
     @property

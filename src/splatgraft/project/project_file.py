@@ -30,15 +30,15 @@ TEMPLATE = """\
 
 # [reconstruct]
 # iterations = 3000
-# budget = 40000             # most Gaussians at any moment
+# budget = 40000             # maximum number of Gaussians
 # eval = true                # hold out every 8th view and measure how well it is predicted
 
 # [segment]
-# masks = "masks"            # where they are not beside the images
-# prompts = "prompts.toml"   # no masks: points on and beside the object in two or three images say what is wanted
+# masks = "masks"            # if they are not beside the images
+# prompts = "prompts.toml"   # without masks: points on and beside the object in two or three images
 # box = [-0.5, -0.5, -0.5, 0.5, 0.5, 0.5]    # or a box around it, in the source's world
 
-# [compose]                  # placement.json beside this file, where there is one, comes first
+# [compose]                  # not used if there is a placement.json beside this file
 # point = [0.0, 0.0, 0.0]    # rest the object on the surface below or above this point of the target
 # on = "IMG_0031.jpg:1210,840"               # or on what an image of the target shows at this pixel
 
@@ -53,12 +53,6 @@ TEMPLATE = """\
 """
 
 
-RENAMED_KEYS: Mapping[str, Mapping[str, str]] = {
-    "compose": {"at": "point"},
-}
-"""Keys of earlier versions by table, with their present names; understood for one version."""
-
-
 @dataclass(frozen=True)
 class ProjectFile:
     """The content of a project.toml."""
@@ -66,15 +60,13 @@ class ProjectFile:
     path: Path
     """The file, for messages and as the base of relative paths."""
     content: Mapping[str, Any]
-    """The tables as read, renamed keys under their present names; tables are known, keys not yet checked."""
-    renamed: tuple[str, ...] = ()
-    """One line per key that was found under an earlier name."""
+    """The tables as read; tables are known, keys not yet checked."""
 
     def step(self, kind: type[T], given: Mapping[str, Path] | None = None, *, out: Path, side: Side | None = None) -> T:
         """Build the step `kind` from its table, which has the class's name in lower case.
 
-        Paths in the table replace the default ones in `given`, by field; the table of `side` takes precedence. A source
-        whose object is fitted again is a draft unless its own table gives a quality.
+        Paths in the table replace the default paths in `given`, by field; the table of `side` takes precedence. A
+        source whose object is fitted again is a draft unless its own table gives a quality.
         """
         name = kind.__name__.lower()
         values, where = dict(self.content.get(name, {})), f"{self.path} [{name}]"
@@ -85,32 +77,32 @@ class ProjectFile:
                 values |= {"quality": "draft"}
             values |= self._of_capture(side) if is_capture else own.get(name, {})
             where = f"{self.path} [{side}]" if is_capture else where
-        # a path in the table replaces the default one, so that a step can read other files; results keep their folders
+        # paths in the table replace default inputs, but not the folder of the result
         layout = {key: path for key, path in (given or {}).items() if key not in values} | {"out": out}
         return from_table(kind, Table(values, where, self.path.parent), layout)
 
     @property
     def _object_is_fitted(self) -> bool:
-        """Whether `segment` fits the object to its photographs again: finer than a reconstruction of all that they show
-        would, and in less time (docs/results.md)."""
+        """Whether `segment` fits the object to its photographs again; it is then more detailed, and sooner ready, than
+        after a finer reconstruction of the whole capture (docs/results.md)."""
         segment = self.content.get("segment", {})
         return segment.get("mask_source") != "box" and segment.get("solidify") != 0
 
     def scene(self, side: Side) -> Path | None:
-        """The trained scene of a side, where one is named."""
+        """Return the path of a side's trained scene, None if the file names none."""
         found = self.content[side].get("scene")
         return None if found is None else path_beside(self.path.parent, found)
 
     def _of_capture(self, side: Side) -> dict[str, Any]:
-        """The keys of [source] or [target] that are options of `capture`; of a scene alone, pictures are made."""
+        """Return the keys of [source] or [target] that are options of `capture`; `scene` replaces `capture`."""
         own = {key: value for key, value in self.content[side].items() if not isinstance(value, dict)}
         scene = own.pop("scene", None)
         return own if scene is None else {"capture": scene} | own
 
 
 def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
-    """Read project.toml, in which `tables` are allowed beside [source] and [target]."""
-    content, renamed = _present_names(path, read_toml(path))
+    """Read project.toml; `tables` are allowed beside [source] and [target]."""
+    content = read_toml(path)
     known = ("source", "target", *tables)
     for name, table in content.items():
         if name not in known:
@@ -122,21 +114,7 @@ def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
         _check_side(path, side, content.get(side, {}))
         if inner := [k for k, v in content[side].items() if isinstance(v, dict) and k != "reconstruct"]:
             raise ValueError(f"{path}: expected no table in [{side}] but [{side}.reconstruct], found {inner[0]}")
-    return ProjectFile(path, content, renamed)
-
-
-def _present_names(path: Path, content: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """The content with renamed keys under their present names, and one line per such key."""
-    present, lines = dict(content), []
-    for name, keys in RENAMED_KEYS.items():
-        table: Any = content.get(name)
-        for old, new in keys.items():
-            if isinstance(table, dict) and old in table:
-                if new in table:
-                    raise ValueError(f"{path} [{name}]: expected {new} alone, found also {old}, its earlier name")
-                present[name] = {new if key == old else key: value for key, value in present[name].items()}
-                lines.append(f"{path} [{name}]: {old} is now called {new}; the next version refuses {old}")
-    return present, tuple(lines)
+    return ProjectFile(path, content)
 
 
 def _check_side(path: Path, side: Side, table: Mapping[str, Any]) -> None:

@@ -1,9 +1,9 @@
-"""Results wanted and finished: a job, the record of its run in step.json, and whether the record still fits the job."""
+"""Records of results: the job of a step, the record of its run in step.json, and why a result is stale."""
 
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,13 @@ from splatgraft.runtime.note import Note
 
 STEP_FILE = "step.json"
 Entry = tuple[str, int, int, str]
-"""Name, size in bytes, modification time in ns, sha256 of one input file."""
+"""Name, size in bytes, modification time in ns and SHA-256 of one input file.
 
-_LONGEST_REASON = 100  # characters; what changed is left out where it is longer
+The hash of a file above `_MAX_HASHED_BYTES` is that of its size and modification time.
+"""
+_MAX_HASHED_BYTES = 4 << 30  # hashing more takes over 10 s; only networks' weights and long videos are larger
+
+_LONGEST_REASON = 100  # characters; longer reasons omit the values
 
 
 @dataclass(frozen=True)
@@ -25,17 +29,15 @@ class Job:
     step: str
     """The command."""
     folder: Path
-    """Where the result goes."""
+    """Folder of the result."""
     inputs: Mapping[str, tuple[Path, ...]]
     """Files whose content the result depends on, by role."""
     options: Mapping[str, Any]
     """Plain JSON values that the result depends on."""
-    defaults: Mapping[str, Any] = field(default_factory=dict)
-    """Defaults of the options that have one: what an earlier version did, which did not have the option yet."""
 
     @cached_property
     def entries(self) -> Mapping[str, tuple[Entry, ...]]:
-        """The input files at the first access, by role; a ValueError where one is missing."""
+        """Entries of the input files by role, as of the first access; raises ValueError if a file is missing."""
         return {role: input_entries(files, ()) for role, files in self.inputs.items()}
 
     @property
@@ -47,14 +49,16 @@ class Job:
 
 
 def input_entries(files: Iterable[Path], known: tuple[Entry, ...]) -> tuple[Entry, ...]:
-    """One entry per file; the hash is taken from `known` where name, size and modification time are the same."""
+    """Return one entry per file; a hash is reused from `known` if name, size and modification time are equal."""
     hashes = {entry[:3]: entry[3] for entry in known}
     entries: list[Entry] = []
     for path in files:
         try:
             status = path.stat()
             key = (path.name, status.st_size, status.st_mtime_ns)
-            if key not in hashes:
+            if key not in hashes and status.st_size > _MAX_HASHED_BYTES:
+                hashes[key] = hashlib.sha256(repr(key[1:]).encode()).hexdigest()
+            elif key not in hashes:
                 with path.open("rb") as stream:
                     hashes[key] = hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError as error:
@@ -80,13 +84,18 @@ class Record:
     seconds: float
     """Wall time of the run that finished; earlier, killed runs do not count."""
     peak_memory_bytes: int
-    """Largest resident memory while it ran."""
+    """Largest resident memory while it ran; 0 if unknown."""
     warnings: tuple[Note, ...] = ()
-    """What may be wrong with the result, in the order in which it was said; pictures are relative to the folder."""
+    """Warnings in the order in which they were printed; pictures are relative to the folder."""
+
+    @property
+    def memory(self) -> str:
+        """The largest resident memory in GiB, as text; empty if unknown."""
+        return f"{self.peak_memory_bytes / 2**30:.2f} GiB" if self.peak_memory_bytes else ""
 
 
 def read_record(folder: Path) -> Record | None:
-    """Read the record of a finished result; None where there is none, a ValueError where step.json is damaged."""
+    """Read the record of a finished result, None if there is none; raises ValueError if step.json is damaged."""
     path = folder / STEP_FILE
     if not path.is_file():
         return None
@@ -100,18 +109,16 @@ def read_record(folder: Path) -> Record | None:
 
 
 def why_stale(job: Job) -> str | None:
-    """Say in a few words why the folder's content is not what `job` would make; None where it is."""
+    """Describe in a few words why the folder is not the result of `job`; None if it is."""
     record = read_record(job.folder)
     if record is None:
         return "not made yet"
     if missing := [name for name in record.outputs if not (job.folder / name).is_file()]:
         return f"{missing[0]} was removed"
     options = json.loads(json.dumps(job.options))
-    # an option that came with a later version than the record's was at its default; one that has gone says nothing
-    before = {**json.loads(json.dumps(job.defaults)), **record.options}
     for key in sorted(options):
-        if options.get(key) != before.get(key):
-            text = f"{key} is now {options.get(key)}, was {before.get(key)}"
+        if options.get(key) != record.options.get(key):
+            text = f"{key} is now {options.get(key)}, was {record.options.get(key)}"
             return text if len(text) < _LONGEST_REASON else f"{key} changed"
     for role in sorted({*job.inputs, *record.inputs}):
         before = record.inputs.get(role, ())
@@ -132,7 +139,7 @@ def write_record(folder: Path, record: Record) -> None:
 
 
 def _plain(note: Note) -> dict[str, Any]:
-    """A warning in the keys of version 0.1.0, and its remedy where it has one."""
+    """Return a warning as plain JSON, with its remedy if it has one."""
     picture = None if note.picture is None else str(note.picture)
     remedy = {"remedy": note.remedy} if note.remedy else {}
     return {"text": note.text, "picture": picture, "minor": note.level == "minor", **remedy}

@@ -1,11 +1,11 @@
-"""The interface of a step, and its execution: locked, timed, resumable, with the result folder replaced as a whole."""
+"""The interface of a step and its execution: locked, timed, resumable, replacing the result folder as a whole."""
 
 import os
 import shutil
 import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, get_args, runtime_checkable
@@ -19,16 +19,15 @@ from splatgraft.runtime.files import atomic_folder, atomic_write, room_on_disk, 
 from splatgraft.runtime.note import Note
 from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
 from splatgraft.runtime.progress import Progress
-from splatgraft.runtime.settings import default_of
 
 if TYPE_CHECKING:
-    import torch  # takes seconds, which the editor's page does not wait for
+    import torch  # takes seconds; the editor's page opens before
 
 Positional = Annotated[Path, tyro.conf.Positional]
 Device = Literal["auto", "cpu", "cuda"]
 Inputs = Mapping[str, tuple[Path, ...]]
 _MACHINE = ("device", "batch", "compile", "processes", "ray", "max_cost", "accept_doubtful")
-"""Options that change where and how fast a step runs, or whether a run goes on after it, not its result."""
+"""Options that change the device, the speed, or whether a run continues after the step, but not the result."""
 _CONTINUES = "; earlier results are complete, and the same command continues when there is room"
 DEFAULT_REMEDIES = {
     "capture": "add or replace the photos named, or take more, sharper and with more overlap: splatgraft check PHOTOS",
@@ -37,11 +36,11 @@ DEFAULT_REMEDIES = {
     "compose": "drag the object to where it should stand and press Drop: splatgraft edit PROJECT, step Place",
     "relight": "turn the arrow of the light to where it comes from: splatgraft edit PROJECT, step Light",
 }
-"""What helps most where a step is unsure and its note says nothing better; PROJECT stands for the project's folder."""
+"""Remedies for warnings that have none of their own, by step; PROJECT is replaced by the project's folder."""
 
 
 class FolderCheckpoint:
-    """A `Checkpoint` with a folder for files; killed runs of one job share it, another job starts with an empty one."""
+    """A `Checkpoint` in a folder. Killed runs of the same job share it; another job starts with an empty one."""
 
     def __init__(self, job: Job) -> None:
         """Open the checkpoint of an earlier run of the same job, or start an empty one."""
@@ -54,7 +53,7 @@ class FolderCheckpoint:
                 stream.write(name.encode())
 
     def load(self) -> dict[str, Any] | None:
-        """The last state saved for this job, or None."""
+        """Return the last state saved for this job, or None."""
         import torch
 
         path = self.folder / "state.pt"
@@ -77,11 +76,11 @@ class Context:
     """Arguments of a step besides its own fields."""
 
     progress: Progress
-    """Moves the progress bar."""
+    """Function that moves the progress bar."""
     checkpoint: FolderCheckpoint
-    """State that a killed run leaves to the next."""
+    """State of a killed run, for the next run."""
     console: Console
-    """For messages."""
+    """Output of messages."""
 
 
 @runtime_checkable
@@ -94,44 +93,37 @@ class Step(Protocol):
         ...
 
     def inputs(self) -> Inputs:
-        """Files that the result depends on, by role.
+        """Return the files that the result depends on, by role.
 
-        Raises: ValueError where one that must be read to know is missing or broken.
+        Raises: ValueError if a file that lists further files is missing or broken.
         """
         ...
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make the result in `folder`."""
+        """Write the result into `folder`."""
         ...
 
 
 def job_of(step: Step) -> Job:
-    """The job of `step`: what its result depends on; a step with `recorded_options` names its options itself."""
+    """Return the job of `step`; a method `recorded_options` of the step replaces its fields."""
     recorded = getattr(step, "recorded_options", None)
     options: dict[str, Any] = plain_options(vars(step)) if recorded is None else recorded()
-    defaults = {one.name: default_of(one) for one in fields(type(step))}  # pyright: ignore[reportArgumentType]
-    return Job(
-        step=type(step).__name__.lower(),
-        folder=step.out,
-        inputs=step.inputs(),
-        options=options,
-        defaults=plain_options({name: value for name, value in defaults.items() if value is not MISSING}),
-    )
+    return Job(step=type(step).__name__.lower(), folder=step.out, inputs=step.inputs(), options=options)
 
 
 def path_fields(step: Step) -> list[Path]:
-    """The paths that `step` reads from."""
+    """Return the paths that `step` reads from."""
     values = [getattr(step, field.name) for field in fields(step) if field.name != "out"]  # pyright: ignore
     return [value for value in values if isinstance(value, Path)]
 
 
 def perform(step: Step, console: Console, *, name: str = "") -> Path:
-    """Do `step`, whether or not its result is stale, and give the folder.
+    """Perform `step`, whether or not its result is stale, and return the result's folder.
 
-    Raises: ValueError where another run works on the same folder, or the inputs are bad.
+    Raises: ValueError if another run works on the same folder, or the inputs are bad.
     """
     job = job_of(step)
-    _ = job.entries  # what is missing is said before anything is touched
+    _ = job.entries  # raises if an input is missing, before any file is changed
     with locked(job.folder), room_on_disk(job.folder, _CONTINUES), console.collecting() as warned:
         checkpoint = FolderCheckpoint(job)
         with console.bar(name or job.step) as progress, replacing(job, warned) as folder:
@@ -141,9 +133,9 @@ def perform(step: Step, console: Console, *, name: str = "") -> Path:
 
 
 def choose_device(wanted: str, console: Console) -> "torch.device":
-    """The device to work on, said aloud.
+    """Return the device to compute on, and print it once.
 
-    Raises: ValueError where CUDA is asked for and there is none, or another device is.
+    Raises: ValueError if CUDA is wanted and absent, or `wanted` is no `Device`.
     """
     import torch
 
@@ -159,9 +151,10 @@ def choose_device(wanted: str, console: Console) -> "torch.device":
 
 
 def plain_options(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings as plain JSON, with the fields of nested dataclasses beside the others.
+    """Return settings as plain JSON; the fields of nested dataclasses become keys beside the others.
 
-    Left out are paths, whose content counts instead, and the machine's settings, which change only rounding.
+    Paths are omitted, because the files' content counts instead; so are settings of the machine, which change only
+    rounding.
     """
     options: dict[str, Any] = {}
     for name, item in values.items():
@@ -174,7 +167,7 @@ def plain_options(values: Mapping[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def locked(folder: Path) -> Generator[None]:
-    """Lock `folder` for this process; a ValueError where another process holds the lock, or it cannot be written."""
+    """Lock `folder` for this process; raises ValueError if another process holds the lock, or it cannot be written."""
     file = folder.with_name(f".{folder.name}.lock")
     lock = filelock.FileLock(file)
     try:
@@ -192,10 +185,11 @@ def locked(folder: Path) -> Generator[None]:
 
 @contextmanager
 def replacing(job: Job, warned: Sequence[Note] = ()) -> Generator[Path]:
-    """Give a new folder to write the result into; at the end it replaces the earlier one and gets its step.json.
+    """Yield a new folder for the result; at the end it gets its step.json and replaces the earlier folder.
 
-    A run that is killed or fails at any point leaves the earlier result complete. `warned` is read at the end. A
-    ValueError where the folder holds files that no step wrote, or an input is missing.
+    A run that is killed or fails at any point leaves the earlier result complete. `warned` is read at the end.
+
+    Raises: ValueError if the folder holds files that no step wrote, or an input is missing.
     """
     inputs = job.entries
     if job.folder.exists() and not job.folder.is_dir():
@@ -221,7 +215,7 @@ def replacing(job: Job, warned: Sequence[Note] = ()) -> Generator[Path]:
 
 
 def _recorded(note: Note, job: Job, new: Path) -> Note:
-    """The note with a remedy, and its picture relative to the result's final folder."""
+    """Return the note with a remedy, and with its picture relative to the result's final folder."""
     remedy = note.remedy or DEFAULT_REMEDIES.get(job.step, "")
     if note.picture is None:
         return replace(note, remedy=remedy)
@@ -230,7 +224,7 @@ def _recorded(note: Note, job: Job, new: Path) -> Note:
 
 
 def clear_leftovers(folder: Path) -> None:
-    """Remove the temporary folders that killed runs left beside a result that is up to date."""
+    """Remove the temporary folders of killed runs beside a result that is up to date."""
     with locked(folder):
         for kind in ("new", "old", "checkpoint"):
             shutil.rmtree(folder.with_name(f".{folder.name}.{kind}"), ignore_errors=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 
 def with_keys(text: str, table: str, values: Mapping[str, Any]) -> str:
-    """Set keys of one top-level table, None removes one; a ValueError where the layout forbids it line by line."""
+    """Set keys of one top-level table; None removes a key. Raises ValueError if the layout is not one key per line."""
     wanted = tomllib.loads(text)
     inside = dict(wanted.get(table, {}))
     for key, value in values.items():
@@ -29,7 +29,7 @@ def with_keys(text: str, table: str, values: Mapping[str, Any]) -> str:
 
 
 def _with_key(text: str, table: str, key: str, value: Any) -> str:
-    # not splitlines, which also splits at characters that end no line in TOML
+    # splitlines would also split at characters that do not end a line in TOML
     lines = text.removesuffix("\n").split("\n")
     start = next((i for i, line in enumerate(lines) if re.match(rf"\s*\[{re.escape(table)}\]\s*(#.*)?$", line)), None)
     if start is None:
@@ -49,7 +49,7 @@ def _with_key(text: str, table: str, key: str, value: Any) -> str:
 
 
 def _value_lines(lines: list[str], at: int) -> int:
-    """Number of lines of the value that begins in line `at`."""
+    """Count the lines of the value that begins in line `at`."""
     for count in range(1, len(lines) - at + 1):
         try:
             tomllib.loads("\n".join(lines[at : at + count]))

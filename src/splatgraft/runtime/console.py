@@ -1,4 +1,4 @@
-"""Console output while steps run: one progress bar per step, or lines without a terminal, and messages of one line."""
+"""Console output of steps: a progress bar each, or lines without a terminal, and messages of one line."""
 
 import time
 from collections.abc import Callable, Generator
@@ -12,7 +12,7 @@ from splatgraft.runtime.note import Note
 from splatgraft.runtime.progress import Progress
 
 _LINES = 10  # lines per counter of a step without a terminal: one per 10%
-_LINE_SECONDS = 1.0  # least time between two of these lines; a step of a second needs none
+_LINE_SECONDS = 1.0  # minimum time between two of these lines
 
 
 class Console:
@@ -26,7 +26,7 @@ class Console:
         self._said: set[str] = set()
 
     def say_once(self, sentence: str) -> None:
-        """Print one line on standard error, where it was not said before."""
+        """Print one line on standard error, unless it was printed before."""
         if sentence not in self._said:
             self._said.add(sentence)
             self.say(sentence)
@@ -36,7 +36,7 @@ class Console:
         self._errors.print(sentence, markup=False, soft_wrap=True)
 
     def tell(self, *notes: Note) -> None:
-        """Print notes on standard error; warnings of a step also go into its step.json and to the top of the report."""
+        """Print notes on standard error; warnings of a step also go into its step.json and the report."""
         for note in notes:
             sentence = f"{note.text} {note.remedy}".rstrip()
             self.say(sentence if note.level == "said" else f"warning: {sentence}")
@@ -64,7 +64,7 @@ class Console:
         """Show a progress bar; without a terminal a line at the start, per 10% and at the end.
 
         Yields:
-            The function that moves the bar: steps done, steps in all, and a short text.
+            The function that moves the bar; it takes steps done, steps in all and a short text.
         """
         if not self._errors.is_terminal:
             began = time.monotonic()
@@ -90,7 +90,7 @@ class Console:
 
 
 class _Lines:
-    """A `Progress` that prints a line where a counter passes a further tenth; a step may count several times."""
+    """A `Progress` that prints a line per tenth of a counter; a step may count several times."""
 
     def __init__(self, name: str, say: Callable[[str], None]) -> None:
         self._name, self._say = name, say

@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, and one line on what cannot be written: a full disk, a read-only folder."""
+"""Atomic writing of files and folders, and errors in one line: a full disk, a read-only folder."""
 
 import ctypes
 import errno
@@ -17,20 +17,20 @@ _NO_ROOM = {
     errno.EROFS: "a read-only disk",
 }
 _NO_RIGHT = {errno.EACCES: "a read-only folder", errno.EPERM: "a read-only folder"}
-"""Only of what is known to write: a file that may not be read has the same numbers."""
+"""Valid only for errors of writing, because unreadable files have the same numbers."""
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
-    """A binary stream that replaces `path` when the block succeeds; when it raises, `path` stays as it was.
+    """Open a binary stream that replaces `path` when the block succeeds; if the block raises, `path` is unchanged.
 
-    Raises: ValueError where the folder does not exist or cannot be written, `path` is a folder, or there is no room.
+    Raises: ValueError if the folder does not exist or cannot be written, `path` is a folder, or there is no room.
     """
     if not path.parent.is_dir():
         raise ValueError(f"{path}: expected an existing folder to write into, found no {path.parent}")
     if path.is_dir():
         raise ValueError(f"{path}: expected a file name to write, found a folder")
-    partial = path.with_name(f".{path.name}.partial")  # fixed: replaces what a killed write left
+    partial = path.with_name(f".{path.name}.partial")  # a fixed name, to replace the rest of a killed write
     with writable(path):
         stream = partial.open("wb")
     try:
@@ -43,7 +43,7 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def atomic_folder(folder: Path) -> Generator[Path]:
-    """A new folder that replaces `folder` when the block succeeds; when it raises, `folder` stays as it was.
+    """Make a new folder that replaces `folder` when the block succeeds; if the block raises, `folder` is unchanged.
 
     Leftovers of a killed run are restored or removed first.
     """
@@ -68,7 +68,7 @@ def atomic_folder(folder: Path) -> Generator[Path]:
 
 
 def _exchange(a: Path, b: Path) -> bool:
-    """Exchange two folders in one system call; False where the system has none."""
+    """Exchange two folders in one system call; returns False if the system has none."""
     at_fdcwd, rename_exchange = -100, 2  # linux/fcntl.h, linux/fs.h
     if sys.platform != "linux":
         return False
@@ -78,8 +78,11 @@ def _exchange(a: Path, b: Path) -> bool:
 
 def _flush(folder: Path) -> None:
     """Write all content to the disk before the rename, so that a power failure cannot leave empty files."""
+    on_windows = sys.platform == "win32"  # it opens no folders, and flushes only files that are open for writing
     for path in [*folder.rglob("*"), folder]:
-        descriptor = os.open(path, os.O_RDONLY)
+        if on_windows and path.is_dir():
+            continue
+        descriptor = os.open(path, os.O_RDWR if on_windows else os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:
@@ -87,13 +90,13 @@ def _flush(folder: Path) -> None:
 
 
 def is_writable(folder: Path) -> bool:
-    """Whether files can be made in a folder, or in the one in which it would be made."""
+    """Return whether files can be made in a folder, or in its nearest existing parent."""
     return os.access(next(path for path in (folder, *folder.parents) if path.exists()), os.W_OK)
 
 
 @contextmanager
 def writable(path: Path) -> Generator[None]:
-    """Turn the errors of a block that does no more than make `path`, where it cannot, into a ValueError of one line."""
+    """Turn errors of a block that only makes `path` into a ValueError of one line, if `path` cannot be written."""
     try:
         yield
     except OSError as error:
@@ -105,9 +108,9 @@ def writable(path: Path) -> Generator[None]:
 
 @contextmanager
 def room_on_disk(path: Path, otherwise: str = "") -> Generator[None]:
-    """Turn errors of a block that writes `path` and found no room on the disk into a ValueError of one line.
+    """Turn errors for lack of room on the disk, in a block that writes `path`, into a ValueError of one line.
 
-    `otherwise` ends the line: what becomes of the work.
+    `otherwise` ends the line; it says how to continue the work.
     """
     try:
         yield
@@ -119,16 +122,16 @@ def room_on_disk(path: Path, otherwise: str = "") -> Generator[None]:
 
 
 def os_error_line(error: OSError) -> str:
-    """An error of the system, in words: the file, where it has one, and what was found."""
+    """Describe an error of the system: the file, if it names one, and the cause."""
     if error.filename is None or error.strerror is None:
         return " ".join(str(error).split())
     return f"{error.filename}: expected a file that can be read and written, found: {error.strerror.lower()}"
 
 
 def _numbers(error: BaseException | None) -> Iterator[int]:
-    """The system's error numbers that mean no room, of an error and of those that it came from.
+    """Yield the system's numbers for lack of room, of an error and of its causes.
 
-    Writers in other languages hide the number or replace the error while they close the file; its text remains.
+    Writers in other languages hide the number or replace the error while they close the file, but keep its text.
     """
     while error is not None:
         for number in _NO_ROOM:

@@ -1,6 +1,6 @@
-"""Files of the Hugging Face hub, fetched once into its client's own cache (`HF_HOME`) by the client itself.
+"""Files of the Hugging Face hub, fetched once by its client into the client's cache (`HF_HOME`).
 
-The client continues interrupted downloads, checks hashes, and takes what is in its cache where there is no network.
+The client continues interrupted downloads, checks hashes, and uses its cache if there is no network.
 """
 
 from collections.abc import Callable, Generator, Sequence
@@ -15,21 +15,22 @@ REPOSITORIES = {
     "birefnet": "onnx-community/BiRefNet-ONNX",
     "lbm": "jasperai/LBM_relighting",
 }
-"""Short names of the repositories that the package loads; their licences stand in docs/reference/weights.md."""
+"""Short names of the repositories that the package loads; docs/reference/weights.md lists their licences."""
 _OTHER_FORMS = ("*.bin", "*.ckpt", "*.msgpack", "*.fp16.*")
-"""Weights that repositories hold beside the same ones as .safetensors; FLUX overflows in fp16."""
+"""Patterns of files that repeat the weights of the .safetensors; FLUX overflows in fp16."""
 
 
 def hub_id(name: str) -> str:
-    """The repository that a short name stands for; any other name, and that of a folder here, as it is."""
+    """Return the repository of a short name; any other name, and a folder's name, is returned unchanged."""
     return name if Path(name).exists() else REPOSITORIES.get(name, name)
 
 
 def hub_folder(repository: str, patterns: Sequence[str], say: Say) -> Path:
-    """Fetch the files of a repository, OWNER/NAME, that match any of the patterns; gives its folder in the cache.
+    """Fetch the files of a repository, OWNER/NAME, that match any of the patterns; returns its folder in the cache.
 
-    `say` takes where the licence is, before anything is fetched. A ValueError where there is no such repository, it is
-    gated, or there is no network and nothing in the cache.
+    `say` first prints the address of the licence.
+
+    Raises: ValueError if the repository does not exist or is gated, or without a network if the cache lacks it.
     """
     with _one_line(repository):
         from huggingface_hub import snapshot_download
@@ -40,7 +41,7 @@ def hub_folder(repository: str, patterns: Sequence[str], say: Say) -> Path:
 
 
 def hub_file(repository: str, name: str) -> Path:
-    """Fetch one file of a repository; errors as of `hub_folder`."""
+    """Fetch one file of a repository; raises the errors of `hub_folder`."""
     with _one_line(repository):
         from huggingface_hub import hf_hub_download
 
@@ -49,7 +50,7 @@ def hub_file(repository: str, name: str) -> Path:
 
 @contextmanager
 def _one_line(repository: str) -> Generator[None]:
-    """Turn what the client raises into one line that says how to mend it."""
+    """Turn the client's errors into one line with a remedy."""
     try:
         yield
     except ModuleNotFoundError:

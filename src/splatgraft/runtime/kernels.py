@@ -1,4 +1,4 @@
-"""Numba kernels: cached under a hash of all sources that they are made of, and run one at a time in a process."""
+"""Numba kernels: cached under a hash of all their sources, and run one at a time in a process."""
 
 import functools
 import hashlib
@@ -14,15 +14,17 @@ KERNEL_LOCK = threading.Lock()
 """Held while a kernel runs: without OpenMP numba uses its workqueue layer, which aborts the process when two threads
 start kernels at the same time."""
 
+# OpenMP shares its threads with torch. TBB, numba's first choice, may wait for minutes at the end of a busy process.
+numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 
 _IMPORT = re.compile(rb"^(?:from [\w.]+ )?import (?:\([^)]*\)|.*)", re.MULTILINE)
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """`numba.njit` with a cache that is renewed when a kernel file that the function's file imports changes, too.
+    """Compile with `numba.njit`; changes of imported kernel files also renew the cached machine code.
 
-    Numba looks at the file of the function alone, and would go on to run what it once inlined from another file.
-    Constants that kernels use stand in files with kernels, too.
+    Numba itself compares only the function's own file, and would keep running code inlined from another file. Constants
+    that kernels use must be in files with kernels, because only those are compared.
     """
     if function is None:
         return functools.partial(kernel, **options)
@@ -34,14 +36,14 @@ def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 @functools.cache
 def _kernel_sources() -> dict[Path, bytes]:
-    """All files of the package that name numba or this module."""
+    """Read all files of the package that name numba or this module."""
     sources = {path: path.read_bytes() for path in sorted(Path(__file__).parents[1].rglob("*.py"))}
     return {path: text for path, text in sources.items() if b"numba" in text or b"runtime.kernels" in text}
 
 
 @functools.cache
 def _hash_of_sources(file: Path) -> str:
-    """Hash of a kernel file and of the kernel files that it imports, directly or through others."""
+    """Hash a kernel file with the kernel files that it imports, directly or through others."""
     sources = _kernel_sources()
     reached, found = set(), {file}
     while found:
@@ -52,8 +54,14 @@ def _hash_of_sources(file: Path) -> str:
     return hashlib.sha256(b"\0".join(sources[path] for path in sorted(reached))).hexdigest()
 
 
+def threading_layer() -> str:
+    """Return the library whose threads run numba's kernels: omp, else workqueue; NUMBA_THREADING_LAYER overrides it."""
+    numba.get_num_threads()  # chooses the layer
+    return numba.threading_layer()
+
+
 def serialized(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """`kernel`, called under the lock; must not be called while the lock is held, nor from another kernel."""
+    """Wrap `kernel` to run under the lock; must not be called while the lock is held, nor from another kernel."""
 
     @functools.wraps(kernel)
     def call(*args: Any) -> Any:

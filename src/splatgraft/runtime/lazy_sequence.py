@@ -7,10 +7,10 @@ T = TypeVar("T")
 
 
 class LazySequence(Sequence[T]):
-    """`count` items, each read anew by `read(index)` on every access."""
+    """A sequence of `count` items; every access calls `read(index)`."""
 
     def __init__(self, count: int, read: Callable[[int], T]) -> None:
-        """Read nothing yet."""
+        """Store the function without calling it."""
         self._count, self._read = count, read
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""The value `Note`: what a stage or a step has to say of its result."""
+"""The value `Note`: one message of a stage or a step on its result."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,16 +7,16 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Note:
-    """One message on a result: a stage returns notes, and a step hands them to `Console.tell`."""
+    """One message on a result; a stage returns notes, and a step passes them to `Console.tell`."""
 
     text: str
     """One or more sentences without line breaks."""
     level: Literal["said", "minor", "warning"] = "said"
-    """said: a fact; minor: something was amiss and the step did what was needed; warning: the result is in doubt."""
+    """said: a fact; minor: a fault that the step has corrected; warning: the result is in doubt."""
     remedy: str = ""
-    """What the user can do about it, a sentence; empty where nothing is known to help."""
+    """Advice to the user, one sentence; empty if none is known."""
     picture: Path | None = None
-    """An image that shows it: in the folder that the step writes, or a photo."""
+    """Image that shows the fault: in the folder that the step writes, or a photo."""
 
     @property
     def in_doubt(self) -> bool:

@@ -9,9 +9,9 @@ class OptionalDependency:
     """One extra of the package, installed by `pip install 'splatgraft[name]'`."""
 
     purpose: str
-    """What it adds."""
+    """Purpose of the extra, for `doctor`."""
     packages: Mapping[str, str]
-    """Module name to the package that provides it."""
+    """Package that provides each module, by the module's name."""
 
 
 OPTIONAL_DEPENDENCIES = {
@@ -33,6 +33,6 @@ OPTIONAL_DEPENDENCIES = {
 
 
 def extra_providing(module: str) -> str | None:
-    """The name of the extra that installs `module`, or None."""
+    """Return the name of the extra that installs `module`, or None."""
     top = module.split(".", maxsplit=1)[0]
     return next((name for name, extra in OPTIONAL_DEPENDENCIES.items() if top in extra.packages), None)

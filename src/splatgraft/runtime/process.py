@@ -1,8 +1,7 @@
-"""Processes: a child with a log, Ctrl-C held back, the end while threads compute, peak memory, opening of a page."""
+"""Processes: children with a log, delayed Ctrl-C, exit while threads compute, peak memory, opening a page."""
 
 import logging
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -28,11 +27,11 @@ def run_logged(
     stdin: str | None = "",
     on_line: Callable[[str], None] | None = None,
 ) -> int:
-    """Run a program and wait for it; an exception in the meantime, an interrupt included, kills the process.
+    """Run a program, wait for it, and return its exit code, negative for a signal.
 
-    Standard error is appended to `log`, and standard output where `on_line` does not take its lines as they come.
-    `stdin` is the text for the standard input; with None it stays open as long as this process lives, so that a program
-    that reads it to the end notices when this process is killed. Gives the exit code, negative for a signal.
+    Any exception while waiting, an interrupt included, kills the program. Standard error is appended to `log`; so is
+    standard output unless `on_line` takes its lines. `stdin` is the text for the standard input. With None the input
+    stays open while this process lives: a program that reads it to the end then notices when this process is killed.
     """
     with log.open("ab") as stream, tempfile.TemporaryFile() as given:
         given.write((stdin or "").encode())
@@ -55,7 +54,7 @@ def run_logged(
 
 
 def source_commit() -> str:
-    """The git commit of this package's source with `-dirty` where it was changed; `unknown` outside a checkout."""
+    """Return the git commit of this package's source, with `-dirty` if it was changed; `unknown` outside a checkout."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude=*"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -65,17 +64,18 @@ def source_commit() -> str:
 
 
 def last_line(log: Path) -> str:
-    """The last line of `log` that is not blank; empty where there is none."""
+    """Return the last line of `log` that is not blank, or an empty text."""
     lines = log.read_text(errors="replace").strip().splitlines() if log.is_file() else []
     return lines[-1].strip() if lines else ""
 
 
 @contextmanager
 def interruption_held(*, terminate: bool = False) -> Generator[Callable[[], bool]]:
-    """Hold back the first Ctrl-C within the block, and with `terminate` a SIGTERM that nothing handles.
+    """Delay the first Ctrl-C within the block, and with `terminate` a SIGTERM that has no handler.
 
-    Yields whether there was one; the block then saves its state and raises KeyboardInterrupt. The second acts at once.
-    Signals whose handler is not Python's own are left alone, and so are blocks in other threads than the main one.
+    Yields a function that returns whether there was one; the block then saves its state and raises KeyboardInterrupt.
+    The second Ctrl-C acts at once. Signals with another handler than Python's own, and blocks outside the main thread,
+    are not affected.
     """
     requested = False
 
@@ -99,15 +99,15 @@ def interruption_held(*, terminate: bool = False) -> Generator[Callable[[], bool
     finally:
         for number, before in held.items():
             signal.signal(number, before)
-    if requested:  # in the block's last moments
+    if requested:  # after the block's last look
         raise KeyboardInterrupt
 
 
 def end_process(status: int) -> NoReturn:
-    """End the process at once with this status, after its output is written.
+    """Write out all output and end the process at once with this status.
 
-    At the end of Python itself a thread that returns from torch to Python is unwound through C++ that forbids it, and
-    the process aborts. So who serves previews from threads ends here, with all files closed.
+    During Python's own shutdown a thread that returns from torch to Python is unwound through C++ code that forbids
+    it, and the process aborts. Programs that compute in threads therefore end here, with all files closed.
     """
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
@@ -116,7 +116,7 @@ def end_process(status: int) -> NoReturn:
 
 
 def reset_peak_memory() -> None:
-    """Reset the peak; where the system cannot (not Linux), it counts from the start of the process."""
+    """Reset the peak of resident memory; only Linux can, elsewhere it counts from the start of the process."""
     try:
         Path("/proc/self/clear_refs").write_text("5")  # man proc: 5 resets VmHWM
     except OSError:
@@ -124,20 +124,24 @@ def reset_peak_memory() -> None:
 
 
 def peak_memory_bytes() -> int:
-    """Peak resident memory since the last reset."""
+    """Return the peak of resident memory since the last reset, in bytes; 0 on Windows, which has no such count."""
     status = Path("/proc/self/status")
     if status.is_file():
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
+    try:
+        import resource  # absent on Windows
+    except ModuleNotFoundError:
+        return 0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
 
 def open_page(page: Path | str) -> bool:
-    """Open a local page or an address and return at once; False where there is no desktop, or nothing that opens pages.
+    """Open a local page or an address and return at once; returns False without a desktop or a program for pages.
 
-    Text browsers, which would take over the terminal, are not used.
+    Text browsers are not used, because they would take over the terminal.
     """
     has_display = sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     opener = _OPENERS.get(sys.platform)

@@ -1,4 +1,4 @@
-"""Interfaces by which a long stage reports its progress and saves checkpoints."""
+"""Interfaces for progress and checkpoints of long stages."""
 
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
@@ -8,7 +8,7 @@ Progress = Callable[[int, int, str], None]
 
 
 def silent(done: int, total: int, message: str) -> None:
-    """A `Progress` that reports nothing."""
+    """Report nothing; a `Progress`."""
 
 
 @runtime_checkable
@@ -16,7 +16,7 @@ class Checkpoint(Protocol):
     """Storage for the state of a long stage: tensors, numbers and nested dicts of them."""
 
     def load(self) -> dict[str, Any] | None:
-        """The state last saved for the same job with the same inputs, or None."""
+        """Return the state last saved for the same job with the same inputs, or None."""
         ...
 
     def save(self, state: dict[str, Any]) -> None:
@@ -28,7 +28,7 @@ class NoCheckpoint:
     """A `Checkpoint` that stores nothing."""
 
     def load(self) -> dict[str, Any] | None:
-        """None."""
+        """Return None."""
         return None
 
     def save(self, state: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Construction of frozen dataclasses from TOML tables, with one-line errors that name the file and the key."""
+"""Frozen dataclasses built from TOML tables, with one-line errors that name the file and the key."""
 
 import json
 import math
@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 T = TypeVar("T")
 
 MAX_TEXT_BYTES = 16 << 20
-"""Largest settings file that is read; a larger one is another file under that name."""
+"""Maximum size of a settings file; a larger one is another kind of file with that name."""
 _LARGEST_INT = 2**63  # TOML's integers have 64 bits
 
 
@@ -25,13 +25,13 @@ class Table:
     values: Mapping[str, Any]
     """Keys and values as read."""
     where: str
-    """For messages: the file and the name of the table."""
+    """File and name of the table, for messages."""
     folder: Path
-    """The folder that its paths are relative to."""
+    """Base folder of the table's relative paths."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file; a ValueError where there is none, or it is not TOML."""
+    """Read a TOML file; raises ValueError if it is missing or not TOML."""
     if path.is_file() and path.stat().st_size > MAX_TEXT_BYTES:
         size = path.stat().st_size >> 20
         raise ValueError(f"{path}: expected at most {MAX_TEXT_BYTES >> 20} MiB of TOML, found {size} MiB")
@@ -64,13 +64,13 @@ def from_table(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
 
 @cache
 def field_types(kind: type) -> dict[str, Any]:
-    """The type of each field of a dataclass, without the annotations that tyro reads."""
+    """Return the type of each field of a dataclass, without the annotations for tyro."""
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: _bare(hints[field.name]) for field in fields(kind)}
 
 
 def choices(hint: Any) -> dict[str, Any]:
-    """The dataclasses of a union of named dataclasses, by name; nothing for any other type."""
+    """Return the dataclasses of a union of named dataclasses, by name; nothing for any other type."""
     kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else ()
     return {kind.name: kind for kind in kinds} if all(map(is_dataclass, kinds)) else {}
 
@@ -84,7 +84,7 @@ def _bare(hint: Any) -> Any:
 
 
 def _choices(kind: type, table: Table) -> dict[str, Any]:
-    """The dataclass that the table, or else the default, chooses for each field with a choice."""
+    """Return the dataclass chosen by the table, or else by the default, for each field with a choice."""
     found: dict[str, Any] = {}
     for field in fields(kind):
         if named := choices(field_types(kind)[field.name]):
@@ -103,7 +103,7 @@ def _keys(kind: type, table: Table) -> set[str]:
 
 
 def default_of(field: "Field[Any]") -> Any:
-    """The default of a field, `MISSING` where it has none."""
+    """Return the default of a field, `MISSING` if it has none."""
     return field.default_factory() if field.default_factory is not MISSING else field.default
 
 
@@ -118,7 +118,7 @@ def _build(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
             values[field.name] = _build(chosen_kinds[field.name], table, {})
         elif is_dataclass(hint):
             nested = field.default_factory() if field.default_factory is not MISSING else None
-            # what the outer class chose for the inner one holds where the table is silent
+            # keys that the table does not set keep the outer class's choice for the inner one
             inner = field_types(type(nested)) if nested else {}
             keys = {key for key, kept in inner.items() if not is_dataclass(kept)} - set(table.values)
             values[field.name] = _build(hint, table, {key: getattr(nested, key) for key in keys})  # pyright: ignore
@@ -130,10 +130,10 @@ def _build(kind: type[T], table: Table, given: Mapping[str, Any]) -> T:
 
 
 def path_beside(folder: Path, text: str) -> Path:
-    """The path that a file in `folder` names, without the steps up (..) that it does not need, for messages."""
+    """Resolve a path named in a file in `folder`, without unnecessary steps up (..), for plain messages."""
     path = folder / Path(text).expanduser()
     plain = Path(os.path.normpath(path))
-    # beyond a symbolic link, a step up leads elsewhere
+    # after a symbolic link, a step up leads to another folder
     return plain if path.exists() and plain.exists() and plain.samefile(path) else path
 
 
@@ -159,7 +159,7 @@ def _convert(value: Any, hint: Any, table: Table, key: str) -> Any:
 
 
 def _convert_any(value: Any, hints: list[Any], table: Table, key: str) -> Any:
-    """Convert `value` to the first of the types that it fits."""
+    """Convert `value` to the first type that accepts it."""
     for hint in hints[:-1]:
         try:
             return _convert(value, hint, table, key)

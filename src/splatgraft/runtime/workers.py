@@ -1,6 +1,6 @@
-"""Independent tasks run in parallel: in threads on this machine, or on many machines through Ray.
+"""Independent tasks in parallel: in threads on this machine, or on many machines through Ray.
 
-A task writes its result to files and first checks whether they exist, so that it can be repeated after a kill, also
+A task writes its result to files and first checks whether they exist. It can therefore be repeated after a kill, even
 on another machine with the same file system.
 """
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from splatgraft.runtime.progress import Progress, silent
 
-_RETRIES = 5  # how often Ray repeats a task whose worker died
+_RETRIES = 5  # repetitions by Ray of a task whose worker died
 
 
 @dataclass(frozen=True)
@@ -19,9 +19,9 @@ class Task:
     """One task, safe to repeat."""
 
     name: str
-    """Shown in failures and in the progress."""
+    """Name in failures and in the progress."""
     work: Callable[[], object]
-    """The function to call; for Ray, a `functools.partial` of a module's function. A ValueError reports bad data."""
+    """Function to call; for Ray, a `functools.partial` of a module's function. It raises ValueError for bad data."""
 
 
 def run_tasks(
@@ -32,11 +32,18 @@ def run_tasks(
     progress: Progress = silent,
     gpus_each: int = 0,
 ) -> list[str]:
-    """Run all tasks, `at_once` in threads, or through Ray; one that fails with a ValueError does not stop the others.
+    """Run all tasks; a task that fails with a ValueError does not stop the others.
 
-    `ray_address`: of a cluster (`auto`, `host:port`, `ray://host:port`) whose machines all see the same files under the
-    same names, or `local` for one of this machine's cores that ends with the call; `gpus_each` it reserves for a task.
-    Gives one line per failed task, in the order of the tasks; any other error of a task is raised.
+    Args:
+        tasks: Independent tasks.
+        at_once: Number of threads, without Ray.
+        ray_address: Address of a Ray cluster (`auto`, `host:port`, `ray://host:port`) whose machines all see the same
+            files under the same names. `local` starts one on this machine's cores, which ends with the call.
+        progress: Called after each task.
+        gpus_each: GPUs that Ray reserves for each task.
+
+    Returns:
+        One line per failed task, in the order of the tasks. Any other error of a task is raised.
     """
     if ray_address is not None:
         return _through_ray(tasks, ray_address, progress, gpus_each)

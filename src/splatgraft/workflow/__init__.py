@@ -1,1 +1,1 @@
-"""The steps of a project as a graph, with time estimates, background jobs and the benchmark's runs."""
+"""The steps of a project as a graph: their order, stale results, time estimates and runs."""

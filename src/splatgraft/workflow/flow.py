@@ -1,4 +1,4 @@
-"""The steps of a project as a graph: which step reads the folder of which other, and which are stale."""
+"""The steps of a project as a graph: the folders that each step reads, and the stale steps."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -40,29 +40,27 @@ class Flow:
     """All steps of a project, each after those it reads from."""
 
     layout: Layout
-    """Where their results are."""
+    """Folders of the results."""
     steps: Mapping[str, Step]
-    """By name: the command, with source/ or target/ before it where both captures need it."""
-    renamed_keys: tuple[str, ...] = ()
-    """One line per key of the project file that has a new name."""
+    """Steps by name: the command, after source/ or target/ if both captures need it."""
 
     def __iter__(self) -> Iterator[tuple[str, Step]]:
         return iter(self.steps.items())
 
     def before(self, name: str) -> list[str]:
-        """The steps whose results `name` reads."""
+        """Return the steps whose results `name` reads."""
         paths = path_fields(self.steps[name])
         return [other for other, step in self if any(path.is_relative_to(step.out) for path in paths)]
 
     def named(self, name: str) -> set[str]:
-        """The steps of that name: reconstruct is both source/reconstruct and target/reconstruct."""
+        """Return the steps of that name: reconstruct is both source/reconstruct and target/reconstruct."""
         found = {step for step in self.steps if name in (step, step.split("/")[-1])}
         if not found:
             raise ValueError(f"--to, --force: expected a step among {', '.join(self.steps)}; found {name}")
         return found
 
     def up_to(self, name: str | None) -> dict[str, Step]:
-        """The steps that `name` depends on, and itself last; all steps where it is None."""
+        """Return the steps that `name` depends on, and itself last; all steps if it is None."""
         wanted = set(self.steps) if name is None else self.named(name)
         for other in reversed(list(self.steps)):
             wanted |= set(self.before(other)) if other in wanted else set()
@@ -70,9 +68,9 @@ class Flow:
 
 
 def read_flow(project: Path, out: Path | None = None) -> Flow:
-    """Read the steps of a project, its file or folder; `out` is the root of the results where that is not its folder.
+    """Read the steps of a project, its file or folder; `out` is the root of the results, by default its folder.
 
-    A ValueError where the file is missing, or one of its keys or values is not as expected.
+    Raises: ValueError if the file is missing, or one of its keys or values is not as expected.
     """
     path = project / PROJECT_FILE if project.is_dir() else project
     file = read_project_file(path, tables=tuple(kind.__name__.lower() for kind in STEPS))
@@ -84,17 +82,17 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
         given = {"capture": layout.capture(side)}
         if (trained := file.scene(side)) is None:
             made = file.step(Reconstruct, given, out=layout.scene(side), side=side)
-        else:  # a trained scene replaces the reconstruction, and is read with the axes that its capture names
+        else:  # a trained scene replaces the reconstruction; by default it has the axes given for its capture
             made = file.step(Adopt, given | {"scene": trained}, out=layout.scene(side), side=side)
             made = replace(made, axes=capture.axes if made.axes is None else made.axes)
         steps[f"{side}/reconstruct"] = made
-    flow = Flow(layout, steps | _joint_steps(file, layout), file.renamed)
+    flow = Flow(layout, steps | _joint_steps(file, layout))
     _require_order(path, flow)
     return flow
 
 
 def _require_order(project: Path, flow: Flow) -> None:
-    """Raises: ValueError where a step reads what it, or a later step, writes."""
+    """Raise ValueError if a step reads its own result or that of a later step."""
     names = list(flow.steps)
     for at, name in enumerate(names):
         for other in flow.before(name):
@@ -117,7 +115,7 @@ def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:
 
 
 def default_paths(layout: Layout) -> dict[type[Any], dict[str, Path]]:
-    """The paths that a project hands to each step after the reconstructions, in the order of the flow."""
+    """Return the input paths that a project gives to each step after the reconstructions, in the order of the flow."""
     source, target = (layout.scene(side) / SCENE_FILE for side in ("source", "target"))
     source_capture, target_capture = layout.capture("source"), layout.capture("target")
     cameras, source_cameras = (layout.capture(side) / CAMERAS_FILE for side in ("target", "source"))
@@ -147,7 +145,7 @@ def default_paths(layout: Layout) -> dict[type[Any], dict[str, Path]]:
 
 
 def reasons(flow: Flow, wanted: Collection[str] | None = None) -> dict[str, str | None]:
-    """The reason why each step is stale, or None; a step after a stale step waits for that step.
+    """Return why each step is stale, None if it is not; a step that reads a stale result waits for it.
 
     `wanted`: names of the steps to examine, with all steps that they read from; inputs of others may be missing.
     """

@@ -1,4 +1,4 @@
-"""Every table and key of project.toml, read from the dataclasses of the steps, and a project.toml with all of them."""
+"""All tables and keys of project.toml, read from the dataclasses of the steps, and a project.toml with all of them."""
 
 import ast
 import inspect
@@ -25,13 +25,13 @@ class Key:
 
     name: str
     type: str
-    """In words, such as `number`, `list of 3 numbers` or `"fast" or "adam"`."""
+    """Type in words, such as `number`, `list of 3 numbers` or `"fast" or "adam"`."""
     default: str
-    """The default as TOML, or in words where TOML has no such value: `none` or `required`."""
+    """The default as TOML, or `none` or `required` if there is no such value."""
     meaning: str
     """One or more sentences, without line breaks."""
     example: str
-    """A value of the right type as TOML: the default where it can be written."""
+    """A value of the right type as TOML: the default if TOML can express it."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +41,19 @@ class KeyTable:
     name: str
     """Name of the table in the file, without brackets, e.g. `source.reconstruct`."""
     meaning: str
-    """What the step does, or what the table is for."""
+    """Purpose of the step or of the table."""
     keys: tuple[Key, ...]
-    """In the order in which the command's help lists them."""
+    """Keys in the order of the command's help."""
     variants: tuple["KeyTable", ...] = ()
-    """Tables of a choice, such as `method` in [harmonize]: the further keys that each choice takes, by name."""
+    """Tables with the further keys of each choice of a key such as `method` in [harmonize]."""
 
 
 def describe_table(
     name: str, kind: type, *, given: Mapping[str, Path] | None = None, omitted: frozenset[str] = frozenset({"out"})
 ) -> KeyTable:
-    """Describe the table whose keys are the fields of a step, without those `omitted`; nested fields are keys too.
+    """Describe the table whose keys are the fields of a step, without those `omitted`; nested fields are keys, too.
 
-    `given`: default paths that a project supplies, by field, relative to the project's folder.
+    `given`: default paths that a project gives, by field, relative to the project's folder.
     """
     keys = tuple(key for key in _keys(kind, None, given or {}) if key.name not in omitted)
     variants = tuple(
@@ -66,7 +66,7 @@ def describe_table(
 
 @cache
 def field_docstrings(kind: type) -> Mapping[str, str]:
-    """The docstring that follows each field of a dataclass, by field, without line breaks; fields may have none."""
+    """Read the docstring after each field of a dataclass, by field, without line breaks; fields may have none."""
     found: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         if is_dataclass(base):
@@ -81,7 +81,7 @@ def field_docstrings(kind: type) -> Mapping[str, str]:
 
 
 def _keys(kind: type, default: Any, given: Mapping[str, Path]) -> list[Key]:
-    """The keys of a dataclass; defaults are those of the instance `default` where there is one."""
+    """List the keys of a dataclass; an instance `default` replaces the class's defaults."""
     found: list[Key] = []
     for field in fields(kind):
         hint = field_types(kind)[field.name]
@@ -104,7 +104,7 @@ def _key(name: str, hint: Any, value: Any, meaning: str) -> Key:
 
 
 def type_words(hint: Any) -> str:
-    """A type in the words of the reference, e.g. `list of 3 numbers`."""
+    """Describe a type in words, e.g. `list of 3 numbers`."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         return " or ".join(type_words(each) for each in arguments if each is not types.NoneType)
@@ -113,13 +113,13 @@ def type_words(hint: Any) -> str:
     if origin is tuple:
         count = "" if arguments[-1] is ... else f"{len(arguments)} "
         one = type_words(arguments[0])
-        # lists of 3 numbers have their plural inside
+        # the plural of "list of 3 numbers" is inside
         return f"list of {count}" + (one.replace("list", "lists", 1) if one.startswith("list") else f"{one}s")
     return _TYPE_NAMES[hint]
 
 
 def type_example(hint: Any) -> str:
-    """A value of the type, as TOML."""
+    """Return a value of the type as TOML."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         return type_example(next(each for each in arguments if each is not types.NoneType))
@@ -147,13 +147,13 @@ _CAPTURE_KEYS = {
 _SIDE_KEYS = (
     Key("capture", "path", "required without scene", "Photos, a video, a COLMAP folder or one with transforms.json.",
         example='"photos"'),
-    Key("scene", "path", "none", "A trained scene (.ply, .spz, .splat, .sog, .glb, .ksplat), which is taken "
-        "over instead of being reconstructed; without a capture, pictures are made of it.", example='"trained.ply"'),
+    Key("scene", "path", "none", "A trained scene (.ply, .spz, .splat, .sog, .glb, .ksplat), which replaces "
+        "the reconstruction; if there is no capture, pictures are made of it.", example='"trained.ply"'),
 )  # fmt: skip
 
 
 def project_keys() -> tuple[KeyTable, ...]:
-    """Every table of project.toml with all its keys: name, type, default and meaning, in the order of the flow.
+    """List every table of project.toml with all its keys: name, type, default and meaning, in the order of the flow.
 
     Paths of results are relative to the folder of project.toml. [source.reconstruct] and [target.reconstruct] take the
     keys of [reconstruct] for one capture alone; the source is a draft unless its own table gives a quality.
@@ -175,11 +175,11 @@ def project_keys() -> tuple[KeyTable, ...]:
 
 _HEAD = """\
 # A splatgraft project with every key. A line such as `#key = value` is a key that is not set; the value is its default,
-# or an example where the default is none. Paths are relative to this file.
+# or an example if the default is none. Paths are relative to this file.
 """
 _OF_ONE_CAPTURE = (
     "[source.reconstruct] and [target.reconstruct] take these keys for one capture alone. The source is a draft unless "
-    "its own table gives a quality, as the object is fitted again."
+    "its own table gives a quality, because the object is fitted again."
 )
 _WIDTH = 118
 
@@ -209,7 +209,7 @@ def full_project_text(*, source: str, target: str) -> str:
 
 
 def _choice_key(table: KeyTable) -> str:
-    """The key whose value chooses among the variants."""
+    """Return the key whose value chooses among the variants."""
     first = json.dumps(table.variants[0].name)
     return next(key.name for key in table.keys if key.type.split(" or ")[0] == first)
 

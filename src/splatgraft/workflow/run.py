@@ -1,4 +1,4 @@
-"""Running a project and reading its state: what the commands `run` and `status` do, also from Python."""
+"""Run a project and read its state, for the commands `run` and `status` and for Python."""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -22,18 +22,16 @@ def run_steps(
     force: tuple[str, ...] = (),
     accept_doubtful: bool = False,
 ) -> None:
-    """Perform the stale steps up to `to`, and those `force` names, and print the paths of the results.
+    """Perform the stale steps up to `to`, and the steps in `force`, and print the paths of the results.
 
-    Raises: ValueError where the project file or an input is bad, another run works on the project, or the poses of a
+    Raises: ValueError if the project file or an input is bad, another run works on the project, or the poses of a
     capture are not plausible and this was not accepted.
     """
     flow = read_flow(project, out)
-    for line in flow.renamed_keys:
-        console.say(line)
     wanted = flow.up_to(to)
     forced = {step for name in force for step in flow.named(name)}
     root = flow.layout.root
-    # where nothing can be written, nothing needs a lock: all may be up to date, else the step says what it cannot write
+    # a read-only project needs no lock; if a step is stale there, the step raises an error about its folder
     with locked(root / "project") if is_writable(root) else nullcontext():
         why = reasons(flow, wanted)
         planned = estimate_step_times(flow, [name for name in wanted if name in forced or why[name] is not None])
@@ -61,14 +59,14 @@ def run_project(
     """Perform the stale steps of a project, as the command `run` does; progress goes to standard error.
 
     Args:
-        project: The project file (docs: `splatgraft init` writes one), or its folder.
-        out: Root of the results; the project's folder where not given.
+        project: The project file, as `splatgraft init` writes it, or its folder.
+        out: Root of the results; the project's folder if not given.
         to: The last step wanted, such as "relight", "reconstruct" (both captures) or "source/reconstruct"; all steps
-            where not given.
-        force: Steps that are performed even where they are up to date.
+            if not given.
+        force: Steps that are performed even if they are up to date.
 
     Returns:
-        The result folder of every wanted step, by step, in their order.
+        The result folder of every wanted step, by step, in the order of the flow.
 
     Raises:
         ValueError: The project file or an input is bad, or another run works on the project.
@@ -79,14 +77,14 @@ def run_project(
 
 
 def stale_steps(project: Path | str, *, out: Path | str | None = None) -> dict[str, str]:
-    """The steps of a project whose results are not up to date.
+    """Return the steps of a project whose results are not up to date.
 
     Args:
         project: The project file, or its folder.
-        out: Root of the results; the project's folder where not given.
+        out: Root of the results; the project's folder if not given.
 
     Returns:
-        Why each stale step is stale, by step, in their order.
+        The reason why each stale step is stale, by step, in the order of the flow.
 
     Raises:
         ValueError: The project file or an input is bad.

@@ -1,4 +1,4 @@
-"""Time estimate of the steps of a run, from their earlier runs, or else from their inputs and typical times."""
+"""Time estimates of the steps of a run, from their earlier runs or else from inputs and typical times."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -35,24 +35,21 @@ _TYPICAL_SECONDS = {
     "consolidate": 2.0,
     "evaluate": 3.0,
 }
-"""Seconds in a first `splatgraft demo` on two cores, compilation of kernels included.
+"""Seconds in a first `splatgraft demo` on two cores, including compilation of the kernels.
 
-Another project differs by a factor, which its finished steps give."""
-_SECONDS_PER_CUT = 1.2  # of each photo whose mask has to be cut
+Other projects differ by a factor, which is taken from their finished steps."""
+_SECONDS_PER_CUT = 1.2  # per photo without a mask
 _SECONDS_PER_OBJECT_PIXEL = 7e-8
-"""Of each step that fits the object, and each pixel of a photo; half for a small object, twice for one that
-fills it."""
-_SECONDS_PER_VIEW, _SECONDS_PER_MEGAPIXEL = 0.12, 0.2
-"""Of each picture of the place that is rendered."""
-_FACTOR = 2.0  # largest factor by which finished steps correct the typical times, and its inverse the least
-_COMPILATION_SECONDS = 25.0
-"""Seconds that compiling the kernels takes in a first reconstruction, a part of its typical time."""
+"""Seconds per step of the object's fit and pixel of a photo; half for a small object, twice for one that fills it."""
+_SECONDS_PER_VIEW, _SECONDS_PER_MEGAPIXEL = 0.12, 0.2  # per rendered picture of the place
+_FACTOR = 2.0  # maximum correction of the typical times by finished steps; its inverse is the minimum
+_COMPILATION_SECONDS = 25.0  # kernels in a first reconstruction; part of its typical time
 
 
 def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, ...]:
-    """Estimate the seconds of each stale step; `is_measured` is false where they are a guess.
+    """Estimate the seconds of each stale step; `is_measured` is false for guesses.
 
-    The finished steps of the project give the factor to the typical times.
+    A guess is a typical time, multiplied by the mean factor of the project's finished steps.
     """
     records = {name: (step, found) for name, step in flow if (found := read_record(step.out)) is not None}
     measured = {name: found.seconds for name, (step, found) in records.items() if _is_as_before(step, found)}
@@ -69,7 +66,7 @@ def estimate_step_times(flow: Flow, stale: Iterable[str]) -> tuple[PlannedStep, 
 
 
 def describe_estimate(planned: Sequence[PlannedStep]) -> str:
-    """One line on how many steps will run and how long they take."""
+    """Describe in one line how many steps will run and for how long."""
     seconds = sum(step.seconds for step in planned)
     duration = f"{max(1, round(seconds / 5)) * 5:.0f} s" if seconds < 90 else f"{seconds / 60:.1f} minutes"
     measured = all(step.is_measured for step in planned)
@@ -78,7 +75,7 @@ def describe_estimate(planned: Sequence[PlannedStep]) -> str:
 
 
 def _is_as_before(step: Step, record: Record) -> bool:
-    """Whether a step will take what it took: a reconstruction depends on its options."""
+    """Return whether a step will take as long as before; the time of a reconstruction depends on its options."""
     if not isinstance(step, Reconstruct):
         return True
     now = plain_options(vars(step.options))
@@ -86,7 +83,7 @@ def _is_as_before(step: Step, record: Record) -> bool:
 
 
 def _typical_seconds(step: Step, flow: Flow) -> float:
-    """Seconds of a first run on two idle cores; what a step cannot read, it says itself when it runs."""
+    """Estimate the seconds of a first run on two idle cores; unreadable inputs are left to the step's own error."""
     typical = _TYPICAL_SECONDS[type(step).__name__.lower()]
     try:
         if isinstance(step, Capture):
@@ -117,15 +114,15 @@ def _photos_to_pose(step: Capture, flow: Flow) -> int:
 
 @dataclass(frozen=True)
 class _Views:
-    """What a capture has, or will have."""
+    """The views of a capture, or those that it will have."""
 
     cameras: Cameras
-    """Of sizes that are right; before the capture is made, their poses are not."""
+    """Cameras with the right sizes; their poses are meaningless before the capture is made."""
     without_masks: int
 
 
 def _views_of(capture: Path, flow: Flow) -> _Views:
-    """Of a capture, or, before it is made, of what it will be made of."""
+    """Read the views of a capture, or of its input before the capture is made."""
     capture = capture.parent if capture.suffix == ".json" else capture
     made_by = next((made_by for _, made_by in flow if made_by.out == capture), None)
     given = made_by.capture if isinstance(made_by, Capture) and not has_poses(capture) else capture

@@ -1,6 +1,6 @@
 """The command `adopt`: a scene that was trained elsewhere replaces a reconstruction.
 
-Where its capture is there, the scene is compared with the points of it, as it is and in other axes.
+If there is a capture, the scene is compared with the capture's points, in its own axes and in others.
 """
 
 from dataclasses import dataclass
@@ -17,34 +17,31 @@ from splatgraft.formats.scenes.axes import rdf_from
 from splatgraft.project.layout import SCENE_FILE
 from splatgraft.project.step import Context, Inputs, Positional
 
-_MAX_DISTANCE = 0.1
-"""Median distance from a point to the nearest Gaussian, over the points' radius, up to which they fit: scenes that were
-trained with these poses have about 0.01."""
-_BETTER = 0.3  # factor on that distance below which other axes are named; set by hand
-_MAX_POINTS, _MIN_POINTS = 2000, 20
-"""Points that are compared, and points below which nothing is said."""
-_AXES = ("RDF", "RUB", "LUF", "RFU")  # axes that are tried: structure from motion, OpenGL, glTF, z up
+_MAX_DISTANCE = 0.1  # median distance from point to Gaussian, over the points' radius; about 0.01 with the right poses
+_BETTER = 0.3  # factor on that distance below which other axes are suggested; set by hand
+_MAX_POINTS, _MIN_POINTS = 2000, 20  # compared points; fewer than the minimum are not compared
+_AXES = ("RDF", "RUB", "LUF", "RFU")  # suggested axes: structure from motion, OpenGL, glTF, z up
 
 
 @dataclass(frozen=True)
 class Adopt:
-    """Take over a trained scene; what its file says and what is assumed of it is printed."""
+    """Take over a trained scene; prints the statements of its file and the assumptions about it."""
 
     scene: Positional
-    """A .ply, .spz, .splat, .sog, .glb or .ksplat, in the frame of its capture where there is one."""
+    """A .ply, .spz, .splat, .sog, .glb or .ksplat, in the frame of its capture if there is one."""
     out: Path = Path("scene")
     """Folder for scene.ply."""
     capture: Path | None = None
-    """Folder of its cameras, which a project makes first; a scene that does not lie where its points are is said to."""
+    """Capture folder of the scene, which a project makes first; warns if the scene and its points do not overlap."""
     axes: str | None = None
-    """Directions of the file's x, y and z (RDF: right, down, front), where those of its format are wrong."""
+    """Directions of the file's x, y and z (RDF: right, down, front), if those of its format are wrong."""
 
     def inputs(self) -> Inputs:
-        """The scene."""
+        """Return the scene's files."""
         return {"scene": scene_files(self.scene)}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make scene.ply."""
+        """Write scene.ply."""
         found = read_scene(self.scene, axes=self.axes)
         for sentence in found.said():
             context.console.say(f"{self.scene}: {sentence}")
@@ -56,7 +53,7 @@ class Adopt:
 
 
 def misfit_of(scene: SceneFile, points: Float[Tensor, "m 3"]) -> str | None:
-    """One sentence where `scene` does not lie at the points of its capture, with axes in which it would; else None."""
+    """Describe why `scene` does not overlap its capture's points, with axes in which it would; None if it does."""
     means = scene.gaussians.means
     means = means[means.isfinite().all(1)]
     points = points[:: max(1, len(points) // _MAX_POINTS)]
@@ -76,13 +73,13 @@ def misfit_of(scene: SceneFile, points: Float[Tensor, "m 3"]) -> str | None:
         return None
     said = (
         f"half of its capture's points lie more than {here:.2f} times their radius from the nearest Gaussian, "
-        f"where scenes of these poses have about 0.01"
+        f"while scenes trained with these poses have about 0.01"
     )
     others = {axes: distance(axes) for axes in _AXES if axes != scene.axes}
     best = min(others, key=lambda axes: others[axes])
     if others[best] < _BETTER * here and others[best] <= _MAX_DISTANCE:
         return f'{said}; with --axes {best} it would be {others[best]:.2f}: set axes = "{best}"'
-    return f"{said}; give the poses that it was trained with, as nerfstudio's export is in another frame than its poses"
+    return f"{said}; give the poses that it was trained with: nerfstudio exports scenes in another frame than its poses"
 
 
 COMMAND = Adopt

@@ -1,4 +1,4 @@
-"""The command `capture`: photos, a video, a posed capture or a trained scene become a folder with transforms.json."""
+"""The command `capture`: make a folder with transforms.json of photos, a video, poses or a trained scene."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -38,8 +38,8 @@ from splatgraft.runtime.note import Note
 
 @dataclass(frozen=True)
 class Capture:
-    """Pose photos or a video; poses that are there already are taken over, and images are then referred to. Of a
-    trained scene without photographs, pictures are made from all around."""
+    """Pose photos or a video. Existing poses are taken over, and their images are referred to. A trained scene without
+    photographs is rendered from all around."""
 
     capture: Positional
     """A folder or a .zip of photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene (.ply,
@@ -49,19 +49,19 @@ class Capture:
     poses: Path | None = None
     """Poses that another program found for photos: a COLMAP folder or a transforms.json."""
     max_side: int = 1600
-    """Longest side at which images are served from here on, pixels; larger ones are reduced once and stored in the
-    result; 0 keeps all."""
+    """Longest side of the images in all later steps, pixels; larger ones are reduced once and stored in the result; 0
+    keeps all sizes."""
     keep_odd: bool = False
-    """Whether blurred photos and copies of other photos are used; without it they are named and left out."""
+    """Whether blurred photos and copies of other photos are used; otherwise they are named and left out."""
     accept_doubtful: bool = False
-    """Whether `run` goes on with poses that are not plausible; without it, it stops after this step."""
+    """Whether `run` continues with poses that are not plausible; otherwise it stops after this step."""
     axes: str | None = None
-    """Directions of x, y and z of a trained scene (RDF: right, down, front), where those of its format are wrong."""
+    """Directions of x, y and z of a trained scene (RDF: right, down, front), if those of its format are wrong."""
     options: PoseOptions = field(default_factory=PoseOptions)
     look: VirtualCameraOptions = field(default_factory=VirtualCameraOptions)
 
     def inputs(self) -> Inputs:
-        """The photos, or the video, or the scene, or the files of the posed capture."""
+        """Return the photos, the video, the scene, or the files of the posed capture."""
         if is_scene(self.capture):
             return {"photos": scene_files(self.capture)}
         if self.poses is None and has_poses(self.capture):
@@ -75,7 +75,7 @@ class Capture:
         return files if self.poses is None else files | {"poses": description_files(self.poses)}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make the posed capture."""
+        """Write the posed capture."""
         if self.poses is not None:
             posed = self._with_given_poses(self.poses, folder, context)
         elif is_scene(self.capture):
@@ -103,7 +103,7 @@ class Capture:
         write_capture(folder, posed.limited(self.max_side) if self.max_side > 0 else posed)
 
     def _taken_over(self, context: Context) -> PosedImages:
-        """Read the posed capture without unusable images, which are logged."""
+        """Read the posed capture without its unusable images, which are printed."""
         given = read_capture(self.capture)
         masks = describe_masks(given.image_paths, given.mask_paths)
         context.console.say(f"{self.capture}: {len(given)} posed images, {len(given.points)} points; {masks}")
@@ -113,7 +113,7 @@ class Capture:
         return posed
 
     def _with_given_poses(self, poses: Path, folder: Path, context: Context) -> PosedImages:
-        """Photos with the poses of another program."""
+        """Combine the photos with the poses of another program."""
         photos = self._photos(folder, context)
         context.console.tell(*exposure_notes(self.capture, photos.paths))
         posed, without_pose, without_photo = read_given_poses(poses, photos)
@@ -126,7 +126,7 @@ class Capture:
         return posed
 
     def _pictures(self, folder: Path, context: Context) -> PosedImages:
-        """Pictures of a scene that came without photographs."""
+        """Render pictures of a scene without photographs."""
         read = read_scene(self.capture, axes=self.axes)
         scene = read.gaussians
         found, report = place_virtual_cameras(scene, self.look, stated_up=read.metadata.up, progress=context.progress)
@@ -162,15 +162,15 @@ class Capture:
 
 
 def doubt_about(step: Capture) -> str | None:
-    """Why the result of `step` should not be built upon and what to do, in one line; None where it may be."""
+    """Describe in one line why the poses of `step` are doubtful and what to do; None if they can be used."""
     doubts = read_doubts(step.out)
     if not doubts or step.accept_doubtful:
         return None
     return (
         f"{step.out}: expected plausible poses, found doubtful ones ({'; '.join(map(str, doubts))}); take "
-        f'more photos with more overlap, or set effort = "thorough", or lens = "each" where zoom or focus '
-        f"changed, or give poses (a COLMAP folder or transforms.json); to go on with these poses, which are kept, set "
-        f"accept_doubtful = true for this capture or use run --accept-doubtful"
+        f'more photos with more overlap, or set effort = "thorough", or lens = "each" if zoom or focus '
+        f"changed, or give poses (a COLMAP folder or transforms.json); to continue with these poses, which are kept, "
+        f"set accept_doubtful = true for this capture or use run --accept-doubtful"
     )
 
 

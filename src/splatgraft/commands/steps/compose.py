@@ -1,6 +1,5 @@
-"""The command `compose`: place an object in a target scene, by a placement or where the object fits."""
+"""The command `compose`: place an object in a target scene, by a given placement or on a surface with room for it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,34 +16,34 @@ from splatgraft.project.placement import ObjectPlacement, Placement, read_placem
 from splatgraft.project.step import Context, Inputs
 from splatgraft.runtime.note import Note
 
-_MUCH_UNSEEN = 0.2  # share of the target's images that show an unphotographed side, from which on that is a warning
+_MUCH_UNSEEN = 0.2  # share of the target's images; warn if more of them show an unphotographed side
 
 
 @dataclass(frozen=True)
 class Compose:
-    """Place the object in the target: as placement.json says, or upright on the surface where it fits."""
+    """Place the object in the target: by placement.json, or upright on a surface with room for it."""
 
     target: Path
     """The scene that receives the object, a .ply."""
     object: Path
     """The object's Gaussians, a .ply; a placement may name others beside it."""
     out: Path = Path("composite")
-    """Folder for placement.json, which `relight` reads beside the target, and the same as scene.ply, is_object.npy."""
+    """Folder for placement.json, which `relight` reads, and the composite as scene.ply and is_object.npy."""
     placement: Path | None = None
-    """placement.json; without it the object is rested on a surface, for which both captures' cameras are needed."""
+    """placement.json; if not given, the object is rested on a surface, which needs both captures' cameras."""
     cameras: Path | None = None
-    """The target's cameras, a capture folder or its transforms.json: from them follow the up direction and what is in
-    view."""
+    """The target's cameras, a capture folder or its transforms.json; they give the up direction and the visible
+    region."""
     object_cameras: Path | None = None
     """The source's cameras, likewise."""
     surroundings: Path | None = None
-    """The source without the object, a .ply: the surface that the object stood on gives the object's base."""
+    """The source without the object, a .ply; the surface that the object stood on gives the object's base."""
     on: str | None = None
-    """Rest the object on what an image of the target shows at a pixel, "IMAGE:X,Y", instead of --point (or --at)."""
+    """Rest the object on the surface that an image of the target shows at a pixel, "IMAGE:X,Y"; replaces --point."""
     options: PlaceOptions = field(default_factory=PlaceOptions)
 
     def inputs(self) -> Inputs:
-        """The scenes, and the placement with its files or the cameras."""
+        """Return the scenes, and the placement with its files or the cameras."""
         scenes = {"target": (self.target,), "object": (self.object,)}
         if self.placement is not None:
             return scenes | {"placement": placement_files(self.placement)}
@@ -55,7 +54,7 @@ class Compose:
         return scenes | {"cameras": (*cameras, *surroundings, *scales)}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Compose and write the scene; where there is no room, a picture of the free places beside the folder."""
+        """Write the composite; if there is no room, write a picture of the free places beside the folder instead."""
         self._free_places.unlink(missing_ok=True)
         target, object_ = read_gaussians(self.target), read_gaussians(self.object)
         placement = (
@@ -67,11 +66,11 @@ class Compose:
 
     @property
     def _free_places(self) -> Path:
-        """Picture beside the result's folder, which a step that fails leaves as it was."""
+        """Picture beside the result's folder, because a failed step leaves that folder unchanged."""
         return self.out.with_name(f"{self.out.name}_free_places.png")
 
     def _found(self, target: Gaussians, object_: Gaussians, folder: Path, context: Context) -> Placement:
-        """The placement on a level surface of the target."""
+        """Place the object on a level surface of the target."""
         if self.cameras is None or self.object_cameras is None:
             raise ValueError(
                 "compose: expected --placement, or --cameras and --object-cameras to find a place, found neither"
@@ -109,7 +108,7 @@ class Compose:
 
 
 def _size(placed: Placed, given: float | None, own: MetricScale | None, place: MetricScale | None) -> str:
-    """How large the object became and why."""
+    """Describe the object's size and the reason for it."""
     parts = []
     if own is not None:
         parts.append(f"{100 * own.metres_per_unit * placed.base.height:.3g} cm tall in its capture ({own.source})")
@@ -125,15 +124,10 @@ def _size(placed: Placed, given: float | None, own: MetricScale | None, place: M
             name for name, scale in (("the object's capture", own), ("the target's capture", place)) if scale is None
         )
         why = (
-            f"a guess, a third of the pictures' height or what there is room for, as the true size of {missing} is not "
-            "known: splatgraft scale tells it, or --scale"
+            f"a guess, a third of the pictures' height or less for lack of room, because the true size of {missing} is "
+            "unknown: give it by splatgraft scale, or by --scale"
         )
     return f"size: {'; '.join([*parts, why])}"
-
-
-def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
-    """`--at` is another name of `--point`."""
-    return ["--point" if word == "--at" else word for word in words]
 
 
 COMMAND = Compose

@@ -1,4 +1,4 @@
-"""The command `consolidate`: the colours of a scene are fitted to harmonised views."""
+"""The command `consolidate`: fit the colours of a scene to harmonised views."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -37,47 +37,47 @@ from splatgraft.runtime.settings import Table, from_table
 
 @dataclass(frozen=True)
 class Consolidate:
-    """Fit the colours of a scene (all SH bands) to harmonised views; geometry and opacity stay."""
+    """Fit the colours of a scene (all SH bands) to harmonised views; geometry and opacity stay fixed."""
 
     scene: Path
     """The composite, or the relit composite, a .ply."""
     views: Path
-    """The folder that `splatgraft render` wrote: its cameras."""
+    """The folder that `splatgraft render` wrote; gives the cameras."""
     images: Path
-    """The folder that `splatgraft harmonize` wrote: images/, and confidence/ where there is one."""
+    """The folder that `splatgraft harmonize` wrote: images/, and confidence/ if there is one."""
     out: Path = Path("result")
     """Folder for scene.ply."""
     method: Literal["fast", "paper"] = "fast"
     """fast: normal equations, then a short gradient descent. paper: 10,000 steps of Adam on LPIPS (its Sec. 6)."""
     loss: Literal["fourier", "l1-dssim", "lpips"] | None = None
-    """Loss of the gradient descent: windowed Fourier magnitudes, that of 3DGS, or LPIPS (VGG; needs its weights); where
-    not given, fourier for fast and lpips for paper."""
+    """Loss of the gradient descent: windowed Fourier magnitudes, the loss of 3DGS, or LPIPS (VGG; needs its weights).
+    If not given, fourier for fast and lpips for paper."""
     updates: int = 1
-    """How often the views are harmonised: after the first time again, by the method that made `images`, from renders of
-    the scene so far (paper, Iterative Dataset Update)."""
+    """Number of harmonisations. The first are `images`; each further one uses the same method on renders of the current
+    scene (paper, Iterative Dataset Update)."""
     schedule: Literal["linear", "geometric"] = "linear"
-    """Noise of the updates, from 1 to 0.1 by equal differences or by equal ratios."""
+    """Noise levels of the updates, from 1 to 0.1 by equal differences or by equal ratios."""
     nuisance: Literal["tint-flow", "none"] = "tint-flow"
-    """Errors of each single view that are solved for together with the colours (fast only)."""
+    """Errors of each single view, solved together with the colours (fast only)."""
     iterations: int = 10_000
-    """Steps of paper; each update after the first has a fifth."""
+    """Steps of method paper; each further update takes a fifth."""
     passes: int = 12
-    """Passes of the gradient descent of fast over all views."""
+    """Passes of method fast over all views in its gradient descent."""
     lpips_weights: Path | None = None
-    """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache where not given."""
+    """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache if not given."""
     low_pass: Literal["classic", "antialiased"] = "classic"
-    """As the scene was trained: `antialiased` for mip-splatting and for gsplat's antialiased mode."""
+    """Screen filter that the scene was trained with: `antialiased` for mip-splatting and gsplat's antialiased mode."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
     def inputs(self) -> Inputs:
-        """The scene, the cameras and the harmonised images."""
+        """Return the scene, the cameras and the harmonised images."""
         views = ViewFolder.open(self.views)
         images = (*self._images(views), *self._confidence_images(views))
         return {"scene": (self.scene,), "cameras": views.files()[:1], "images": images}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make scene.ply."""
+        """Write scene.ply."""
         if self.updates < 1:
             raise ValueError(f"consolidate: expected updates of at least 1, found {self.updates}")
         device = choose_device(self.device, context.console)
@@ -108,7 +108,7 @@ class Consolidate:
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
 
     def harmonizer_options(self) -> HarmonizerOptions:
-        """The method that made `images`, from their step.json."""
+        """Read the options of the method that made `images` from their step.json."""
         record = read_record(self.images)
         if record is None or record.options.get("method") not in HARMONIZERS:
             found = "none" if record is None else record.options.get("method")
@@ -124,7 +124,7 @@ class Consolidate:
         count, strengths = len(views) * (self.updates - 1), noise_levels(self.schedule, self.updates)
         harmonizer = make_harmonizer(options, HarmonizerContext(device, count, width * height, strengths, say))
         if not isinstance(harmonizer, NoisyStartHarmonizer):
-            say(f"{options.name}: no noise; each of {self.updates} updates begins at renders of the scene so far")
+            say(f"{options.name}: no noise levels; each of {self.updates} updates begins at renders of the scene")
         return harmonizer
 
     def _options(self) -> ConsolidateOptions:
@@ -153,7 +153,7 @@ class Consolidate:
 
 @dataclass(frozen=True)
 class _FromNoise:
-    """A harmoniser that starts from the view's prior at a noise level, where it knows noise."""
+    """A harmoniser that starts from the view's prior at a noise level, if it has noise levels."""
 
     harmonizer: Harmonizer
     strength: float
@@ -168,7 +168,7 @@ class _FromNoise:
 def _views_of(
     scene: Gaussians, views: ViewFolder, cameras: Cameras, options: RenderOptions
 ) -> Sequence[HarmonizerInputs]:
-    """The views with a render of `scene` as their prior; the composite stays the condition."""
+    """Return the views with renders of `scene` as their priors; the composite stays the condition."""
 
     @torch.no_grad()
     def view(index: int) -> HarmonizerInputs:

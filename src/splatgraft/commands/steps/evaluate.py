@@ -1,4 +1,4 @@
-"""The command `evaluate`: pictures before and after, metrics where there is ground truth, and a page with both."""
+"""The command `evaluate`: pictures before and after, metrics if there is ground truth, and a page with both."""
 
 import os
 import platform
@@ -43,12 +43,12 @@ from splatgraft.runtime.note import Note
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Compare the result with copy-paste and, where it exists, with ground truth; write pictures and index.html."""
+    """Compare the result with copy-paste and, if it exists, with ground truth; write pictures and index.html."""
 
     result: Path
     """The consolidated scene, a .ply."""
     composite: Path
-    """The folder of the composite: the object as it was captured."""
+    """The folder of the composite, which holds the object as captured."""
     cameras: Path
     """The target's cameras: a capture folder or its transforms.json."""
     out: Path = Path("report")
@@ -56,27 +56,26 @@ class Evaluate:
     ground_truth: Path | None = None
     """A capture of the target with the real object in it, with masks; its views are compared."""
     target_capture: Path | None = None
-    """The target's images, without the object; needed with a ground truth."""
+    """The target's images without the object; needed with a ground truth."""
     views: Path | None = None
-    """The folder of harmonised views: views of the ground truth that are not among them count as held out."""
+    """The folder of harmonised views; other views of the ground truth count as held out."""
     light: Path | None = None
     """The report of the light transfer, a text file."""
     project: Path | None = None
-    """The folder of all results: the page then shows the warnings and the time of each step."""
+    """The folder of all results; the page then shows the warnings and the time of each step."""
     lpips_weights: Path | None = None
-    """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache where not given."""
+    """Folder with vgg16-397923af.pth and vgg.pth; torch hub's cache if not given."""
     pictured: int = 8
-    """How many views the page shows."""
+    """Number of views on the page."""
     width: int | None = None
-    """Width of the pictures, pixels; that of the cameras where not given. Pictures beside a ground truth keep its
-    size."""
+    """Width of the pictures, pixels; that of the cameras if not given. With a ground truth, pictures have its size."""
     frames: int = 48
-    """Frames of the turntable; 0 makes none."""
+    """Frames of the turntable; 0 for no turntable."""
     device: Device = "auto"
-    """Where to render."""
+    """Device to render on."""
 
     def inputs(self) -> Inputs:
-        """The scenes, the cameras and the truth."""
+        """Return the scenes, the cameras, the light and the truth."""
         composite = (self.composite / SCENE_FILE, self.composite / "is_object.npy")
         light = () if self.light is None else (self.light,)
         truth = truth_files(self.ground_truth, self.target_capture)
@@ -88,12 +87,12 @@ class Evaluate:
         }
 
     def recorded_options(self) -> dict[str, Any]:
-        """The options in step.json, and the warnings that the page shows, where there are any."""
+        """Return the options for step.json, with the warnings that the page shows."""
         warned = [f"{label}: {warning.text}" for label, _, warning in _warnings(self.project)]
         return plain_options(vars(self)) | ({"warnings": warned} if warned else {})
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make the report."""
+        """Write the report."""
         device = choose_device(self.device, context.console)
         scenes = EvaluatedScenes.read(self.result, self.composite, self.cameras, device=device)
         metrics, missing = None, {}
@@ -111,8 +110,7 @@ class Evaluate:
             pictures = [sized.pictures_from(cameras[i]) for i in list(chosen)[: self.pictured]]
         changes = [describe_change(p.result, p.copy_paste, p.mask) for p in pictures]
         best = max(pictures, key=lambda p: p.prominence)
-        # the page begins with it
-        pictures = [best, *(p for p in pictures if p is not best)]
+        pictures = [best, *(p for p in pictures if p is not best)]  # the best view comes first on the page
         self._write_pictures(folder, best)
         turntable = _turntable(scenes, self.frames, context) if self.frames else []
         if turntable:
@@ -155,17 +153,17 @@ class Evaluate:
         write_image(folder / "before_after.png", three)
 
 
-_WARNING_PX = 640  # width of the pictures beside warnings: twice that at which the page shows them
-_GEOMETRY_VIEWS = 2  # those that show the object best
-_GEOMETRY_PX = 640  # longest side: twice that at which the page shows them
+_WARNING_PX = 640  # width of the pictures beside warnings: twice their width on the page
+_GEOMETRY_VIEWS = 2  # views with depth and normals
+_GEOMETRY_PX = 640  # longest side of these: twice their size on the page
 _LIMITS = (
-    "There is no ground truth for these captures: the pictures show what was done, not how right it is.",
-    "Viewpoints far from the captured ones show less than the captured ones do.",
+    "There is no ground truth for these captures: the pictures show the change, not whether it is right.",
+    "Views far from the captured viewpoints are less reliable than the pictures here.",
 )
 
 
 def _spread(count: int, wanted: int) -> list[int]:
-    """At most `wanted` of `count` indices, evenly spaced."""
+    """Return at most `wanted` of `count` indices, evenly spaced."""
     return sorted({round(i) for i in torch.linspace(0, count - 1, min(count, wanted)).tolist()})
 
 
@@ -205,7 +203,7 @@ def _turntable(scenes: EvaluatedScenes, frames: int, context: Context) -> list[t
 
 
 def _records(project: Path) -> Iterator[tuple[str, Path, Record]]:
-    """The steps before this one: what the page calls them, their folders and their records."""
+    """Yield the steps before this one: label on the page, folder and record."""
     for name in RESULTS_IN_ORDER[:-1]:
         if (record := read_record(project / name)) is not None:
             yield f"{name.split('/')[0]}: {record.step}" if "/" in name else record.step, project / name, record
@@ -213,20 +211,20 @@ def _records(project: Path) -> Iterator[tuple[str, Path, Record]]:
 
 def _step_times(project: Path) -> tuple[StepTime, ...]:
     return tuple(
-        StepTime(label, record.seconds, f"at most {record.peak_memory_bytes / 2**30:.2f} GiB of memory")
+        StepTime(label, record.seconds, f"at most {record.memory} of memory" if record.memory else "")
         for label, _, record in _records(project)
     )
 
 
 def _warnings(project: Path | None) -> Iterator[tuple[str, Path, Note]]:
-    """All warnings of a project with the names and the folders of the steps that said them."""
+    """Yield all warnings of a project with the labels and the folders of their steps."""
     if project is not None:
         for label, folder, record in _records(project):
             yield from ((label, folder, warning) for warning in record.warnings)
 
 
 def _report_warnings(project: Path | None, best: Pictures) -> tuple[ReportWarning, ...]:
-    """The warnings with their pictures; of a place or a light without one, the view that shows most of the object."""
+    """Return the warnings with their pictures; those on place and light without one get the best view of the object."""
     shown = {"compose": best.copy_paste, "relight": best.result}
     found: list[ReportWarning] = []
     for label, folder, warning in _warnings(project):

@@ -1,7 +1,6 @@
-"""The command `harmonize`: rendered views become harmonised views, one image each."""
+"""The command `harmonize`: make one harmonised image of each rendered view."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,18 +16,21 @@ from splatgraft.folders.harmonized_views import (
     picture_folders,
 )
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import HARMONIZERS, CompactOptions, EditOptions, FluxOptions, NoneOptions
+from splatgraft.harmonization import CompactOptions, EditOptions, FluxOptions, NoneOptions
 from splatgraft.project.step import Context, Device, Inputs, Positional, plain_options
+
+_WEIGHTS = ("weights", "base", "model", "lora")  # options of the methods that name weights
+_WEIGHT_SUFFIXES = (".json", ".safetensors", ".bin")  # a training's folder also holds logs and pictures
 
 
 @dataclass(frozen=True)
 class Harmonize:
-    """Make the light of each view agree with an image model; views that a killed run finished are kept."""
+    """Make the light of each view agree, by an image model; finished views of a killed run are kept."""
 
     views: Positional
     """The folder that `splatgraft render` wrote for a composite."""
     out: Path = Path("harmonized")
-    """Folder for images/, and confidence/ where the method estimates its reliability per pixel."""
+    """Folder for images/, and confidence/ if the method estimates its reliability per pixel."""
     method: (
         Annotated[NoneOptions, subcommand("none")]
         | Annotated[CompactOptions, subcommand("compact")]
@@ -37,32 +39,27 @@ class Harmonize:
     ) = field(default_factory=NoneOptions)
     """The image model; its options are further keys of the table, or options of the sub-command."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
     processes: int = 1
-    """GPUs of this machine, or with --ray workers anywhere, over which the views are split."""
+    """Number of GPUs of this machine, or with --ray of workers anywhere, that share the views."""
     ray: str | None = None
     """Address of a Ray cluster whose machines all see the folders."""
 
     def inputs(self) -> Inputs:
-        """All pictures of all views, and the small files that identify the weights."""
-        files: dict[str, tuple[Path, ...]] = {"views": ViewFolder.open(self.views).files()}
-        lora = getattr(self.method, "lora", None)
-        weights = getattr(self.method, "weights", None) or getattr(self.method, "model", None)
-        if lora is not None:
-            files["lora"] = (lora,)
-        if weights is not None and Path(weights).is_dir():
-            files["weights"] = tuple(sorted(Path(weights).glob("**/*.json")))
-        return files
+        """Return all pictures of all views, and the files of weights on this machine; hub ids are options."""
+        named = [path for name in _WEIGHTS if (path := getattr(self.method, name, None)) is not None]
+        weights = tuple(file for path in named for file in _weight_files(path))
+        return {"views": ViewFolder.open(self.views).files(), "weights": weights}
 
     def recorded_options(self) -> dict[str, Any]:
-        """The options in step.json: the method and its own."""
+        """Return the options for step.json: the method's name and its own options."""
         lora = getattr(self.method, "lora", None)
-        # a path is left out of plain options, but `consolidate` with updates makes the method again
+        # plain options omit paths, but `consolidate` with updates needs this one to make the method again
         given = {} if lora is None else {"lora": str(lora.resolve())}
         return plain_options({"method": self.method.name, **vars(self.method)}) | given
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make one image per view."""
+        """Write one image per view."""
         kept, views = context.checkpoint.folder, ViewFolder.open(self.views)
         picture_folders(kept)
         whole = Part(self.views, self.method, kept, device=self.device)
@@ -80,17 +77,12 @@ class Harmonize:
                 shutil.copytree(kept / name, folder / name)
 
 
-def current_arguments(words: list[str], say: Callable[[str], None]) -> list[str]:
-    """`--method NAME`, the form of version 0.1.0, becomes the sub-command NAME."""
-    words = [part for word in words for part in (word.split("=", 1) if word.startswith("--method=") else [word])]
-    if "--method" not in words[:-1]:
-        return words
-    at = words.index("--method")
-    name = words[at + 1]
-    if name not in HARMONIZERS:
-        raise ValueError(f"--method: expected one of {', '.join(sorted(HARMONIZERS))}, found {name!r}")
-    say(f"--method {name} is now a sub-command: splatgraft harmonize {name} VIEWS; the next version drops --method")
-    return [name, *words[:at], *words[at + 2 :]]
+def _weight_files(named: Path | str) -> list[Path]:
+    """List the files of a file or folder of weights; none of a hub id."""
+    path = Path(named)
+    if path.is_dir():
+        return [file for file in sorted(path.rglob("*")) if file.suffix in _WEIGHT_SUFFIXES]
+    return [path] if path.is_file() or isinstance(named, Path) else []
 
 
 COMMAND = Harmonize

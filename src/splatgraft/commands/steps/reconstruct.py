@@ -1,4 +1,4 @@
-"""The command `reconstruct`: a capture folder becomes a folder with scene.ply."""
+"""The command `reconstruct`: train a scene.ply on a capture folder."""
 
 import json
 from dataclasses import dataclass, field, replace
@@ -28,12 +28,7 @@ from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.note import Note
 
 EVAL_EVERY = 8
-"""Every 8th view, as in 3DGS."""
-
-
-_FAR_BELOW_DEVIATIONS, _FAR_BELOW_DB = 3.0, 3.0
-"""A held-out view is far worse than the rest from so many robust standard deviations (1.4826 median absolute
-deviations) below the median PSNR: the usual three, and twice the squared error at least."""
+"""Interval of held-out views, as in 3DGS."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +44,11 @@ class Reconstruct:
     options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(device="auto"))
 
     def inputs(self) -> Inputs:
-        """The files of the capture, without masks."""
+        """Return the files of the capture, without masks."""
         return capture_inputs(self.capture, read_capture(self.capture))
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make scene.ply, and metrics.json where views are held out."""
+        """Write scene.ply, and metrics.json if views are held out."""
         capture = readable_views(read_capture(self.capture), progress=context.progress)
         context.console.tell(*left_out_notes(self.capture, len(capture), capture.left_out))
         require_coverage(capture, str(self.capture))
@@ -67,7 +62,7 @@ class Reconstruct:
             seconds = predict_cpu_seconds(capture.cameras, options) / threads
             context.console.say(f"time: about {describe_duration(seconds)} on {threads} idle cores, half or twice that")
         warnings = exposure_notes(self.capture, capture.image_paths)
-        if read_record(self.capture) is None:  # of its own results the command `capture` has said it
+        if read_record(self.capture) is None:  # the command `capture` has printed them already
             context.console.tell(*warnings)
         if options.photo_colors is None:
             options = replace(options, photo_colors=bool(warnings))
@@ -88,11 +83,11 @@ class Reconstruct:
 
 
 def far_worse(psnr_by_view: dict[str, float]) -> dict[str, str]:
-    """One sentence per held-out view far worse than the rest, the worst first, by photo; `psnr_by_view` is in dB."""
+    """Describe each held-out view far worse than the rest, by photo, the worst first; `psnr_by_view` is in dB."""
     values = np.array(list(psnr_by_view.values()))
     middle = float(np.median(values))
-    spread = 1.4826 * float(np.median(np.abs(values - middle)))
-    limit = middle - max(_FAR_BELOW_DEVIATIONS * spread, _FAR_BELOW_DB)
+    deviation = 1.4826 * float(np.median(np.abs(values - middle)))  # robust standard deviation
+    limit = middle - max(3 * deviation, 3.0)  # the usual three deviations, and at least twice the squared error
     return {
         name: f"held out: {name} is far worse than the rest: {value:.1f} dB, median {middle:.1f} dB; its pose may be "
         f"wrong, or the photo blurred"
@@ -102,9 +97,9 @@ def far_worse(psnr_by_view: dict[str, float]) -> dict[str, str]:
 
 
 def _held_out_metrics(scene: Gaussians, capture: PosedImages, options: ReconstructOptions) -> dict[str, Any]:
-    """Means over the held-out views, and the PSNR of each.
+    """Measure the held-out views: means over them, and the PSNR of each.
 
-    `psnr` and `ssim` are of the views as photographed, `psnr_color_fitted` without exposure and white balance.
+    `psnr` and `ssim` compare with the photos; for `psnr_color_fitted`, exposure and white balance are fitted first.
     """
     views = capture.select(held_out(len(capture), options.eval_every))
     values: list[tuple[float, float, float]] = []

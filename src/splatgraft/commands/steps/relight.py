@@ -32,28 +32,28 @@ class Relight:
     target: Path
     """The scene that receives the object, a .ply."""
     placement: Path
-    """placement.json in the composite's folder: it names the objects. The composite's scene.ply is not read."""
+    """placement.json in the composite's folder; it names the objects. The composite's scene.ply is not read."""
     cameras: Path
-    """The target's cameras, a capture folder or its transforms.json: from them follows the up direction."""
+    """The target's cameras, a capture folder or its transforms.json; they give the up direction."""
     out: Path = Path("relit")
-    """Folder for scene.ply, is_object.npy, light.json, light.txt, which describes the light in words, and light.png and
-    source_light_N.png, which show it."""
+    """Folder for scene.ply, is_object.npy, light.json, light.txt (the light in words), light.png and source_light_N.png
+    (pictures of the lights)."""
     surroundings: Path | None = None
-    """The source without its object, a .ply: from it the light on the object at capture is estimated and divided out.
-    Objects of other files, and all of them without it, keep their mean brightness."""
+    """The source without its object, a .ply; the light on the object at capture is estimated from it and divided out.
+    Objects of other files, and all objects if it is not given, keep their mean brightness."""
     object_cameras: Path | None = None
     """The source's cameras, likewise."""
     taken: Path | None = None
-    """File of the object that was taken from the source, as the placement names it; the first where not given."""
+    """File of the object that was taken from the source, as the placement names it; the first one if not given."""
     light: Literal["transfer", "off"] = "transfer"
     """transfer: shading and shadows; off: the object as it was captured (the paper's configuration)."""
     given_light: Path | None = None
-    """A light.json that replaces the estimate: one that an earlier run wrote, changed or not."""
+    """A light.json that replaces the estimate, such as an edited one of an earlier run."""
     options: RelightOptions = field(default_factory=RelightOptions)
     weights: LayerWeights = field(default_factory=LayerWeights)
 
     def inputs(self) -> Inputs:
-        """Scenes, placement and cameras."""
+        """Return the scenes, the placement, the cameras and the given light."""
         source = () if self.surroundings is None else (self.surroundings,)
         source += () if self.object_cameras is None else camera_files(self.object_cameras)
         placement = placement_files(self.placement)
@@ -84,8 +84,8 @@ class Relight:
         context.console.tell(*(replace(note, picture=picture if picture.is_file() else None) for note in notes))
 
     def _level(self, relit: Relit) -> tuple[Note, ...]:
-        """What the exposure metadata of both captures says of the level; their photos are no inputs, as only this
-        depends on them."""
+        """Compare the light's level with the exposure metadata of both captures. Their photos are no inputs of the
+        step, because only this note depends on them."""
         if self.object_cameras is None:
             return ()
         try:
@@ -95,7 +95,7 @@ class Relight:
         return () if target is None or source is None else describe_level(relit, target=target, source=source)
 
     def given(self) -> Light | None:
-        """The light that replaces the estimate; None where none is named."""
+        """Read the light that replaces the estimate; None if none is given."""
         if self.given_light is None:
             return None
         if not self.given_light.is_file():

@@ -1,4 +1,4 @@
-"""The command `render`: pictures of a scene, or of a composite all pictures that a harmoniser takes."""
+"""The command `render`: pictures of a scene, or all input pictures of a harmoniser for a composite."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,29 +23,29 @@ from splatgraft.rendering import RenderOptions, render
 
 @dataclass(frozen=True)
 class Render:
-    """Render a scene from given cameras; with --is-object and --prior, all pictures of a composite."""
+    """Render a scene from given cameras; with --is-object and --prior, all input pictures of a harmoniser."""
 
     scene: Path
     """The scene, or the composite, a .ply."""
     cameras: Path
     """A transforms.json, or any capture folder."""
     out: Path = Path("views")
-    """Folder for the pictures. Of a plain scene it is a capture: images/ and transforms.json."""
+    """Folder for the pictures; for a plain scene it is a capture with images/ and transforms.json."""
     is_object: Path | None = None
     """is_object.npy of a composite: also write background/, mask/, depth/ and normal/."""
     prior: Path | None = None
-    """The relit composite, a .ply, for prior/; the composite itself where not given."""
+    """The relit composite, a .ply, for prior/; the composite itself if not given."""
     light: Path | None = None
-    """light.json that `relight` wrote beside the prior: how reliable the prior is. Without it the reliability is 0."""
+    """light.json that `relight` wrote beside the prior; gives the prior's reliability, which is 0 if not given."""
     eval: bool = False
     """Leave out every 8th camera, so that `evaluate` has views that no later step has seen."""
     low_pass: Literal["classic", "antialiased"] = "classic"
-    """As the scene was trained: `antialiased` for mip-splatting and for gsplat's antialiased mode."""
+    """Screen filter that the scene was trained with: `antialiased` for mip-splatting and gsplat's antialiased mode."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
 
     def inputs(self) -> Inputs:
-        """Scenes and cameras."""
+        """Return the scenes, the cameras and the light."""
         optional = {"is_object": self.is_object, "prior": self.prior}
         given = {role: (path,) for role, path in optional.items() if path is not None}
         if self.light is not None and self.light.is_file():
@@ -57,7 +57,7 @@ class Render:
             return 0.0
         if self.light.is_file():
             return light_confidence(light_from_json(self.light.read_text(), name=str(self.light)))
-        # `relight` writes its notes always, and a light only where it transferred one
+        # `relight` always writes its notes, but a light only if it transferred one
         if (self.light.parent / LIGHT_TEXT_FILE).is_file():
             return 0.0
         raise ValueError(f"{self.light}: expected the light.json that relight wrote, found no such file")

@@ -1,4 +1,4 @@
-"""The command `segment`: a scene and 2D masks become the object's Gaussians and the scene without them."""
+"""The command `segment`: split a scene into the object's Gaussians and the rest, by 2D masks."""
 
 import json
 from collections.abc import Sequence
@@ -63,9 +63,9 @@ from splatgraft.segmentation import (
 SHEET_FILE = "views.png"
 AGREEMENT_FILE = "agreement.json"
 SOLID_SIDE_PX = 960
-"""Longest side at which the object is made solid: time and memory go with the area."""
+"""Longest side of the photos that the object is fitted to; time and memory grow with their area."""
 _PICTURED = 8  # photographs on the sheet
-_MUCH_GUESSED = 0.1  # share of the surface that no photograph shows, from which on that is a warning
+_MUCH_GUESSED = 0.1  # share of the surface; warn if more was never photographed
 
 
 @dataclass(frozen=True)
@@ -75,42 +75,42 @@ class Segment:
     scene: Path
     """The reconstruction, a .ply."""
     capture: Path
-    """The posed images that it was made of."""
+    """The posed images that the scene was made of."""
     out: Path = Path("object")
-    """Folder for object.ply, is_guessed.npy (what closes its unseen side), surroundings.ply (the scene without it),
-    selection.npy, feature.npy, agreement.json and views.png (how well the masks agree); masks/ where made."""
+    """Folder for object.ply, is_guessed.npy (Gaussians that close its unseen side), surroundings.ply (the scene without
+    the object), selection.npy, feature.npy, agreement.json and views.png (agreement of the masks); masks/ if made."""
     mask_source: MaskSource = "auto"
     """files: masks/ beside the images, or --masks. grabcut, sam2: cut from the images, guided by the scene, --prompts
-    and --box. birefnet: from a network. box: no masks, all Gaussians whose centre is in the box (of a scene that is the
-    object alone: a box around all). auto: files where every image has one, else grabcut."""
+    and --box. birefnet: from a network. box: no masks, all Gaussians whose centre is in the box (if the scene is the
+    object alone, a box around everything). auto: files if every image has one, else grabcut."""
     masks: Path | None = None
-    """Folder of masks named like the images, white where the object is; views without one are left out."""
+    """Folder of masks named like the images, white on the object; views without a mask are left out."""
     prompts: Path | None = None
     """A .toml or .json with points and rectangles on the object in two or three images, for grabcut and sam2."""
     box: tuple[float, float, float, float, float, float] | None = None
-    """Least x, y, z, then greatest, around the object in the source's world; guessed where not given."""
+    """Minimum x, y, z, then maximum, of a box around the object in the source's world; guessed if not given."""
     sam2_encoder: Path | None = None
     """An .onnx file of SAM 2's image encoder, for sam2."""
     sam2_decoder: Path | None = None
     """An .onnx file of SAM 2's prompt decoder, for sam2."""
     birefnet: Path | None = None
-    """An .onnx file of BiRefNet; fetched once from its hub where not given."""
+    """An .onnx file of BiRefNet; fetched once from the hub if not given."""
     threshold: float = 0.75
-    """Least share of a Gaussian that the masks must give to the object."""
+    """Minimum share of a Gaussian's blending weight inside the masks."""
     keep: Keep = "substantial"
-    """Which separate pieces stay: those with at least a twentieth of the largest one's opacity, the largest, or all."""
+    """Separate pieces to keep: those with at least a twentieth of the largest one's opacity, the largest, or all."""
     corrections: Path | None = None
-    """A .npy with one int8 per Gaussian of the scene, as the editor writes it: 1 adds it to the object, -1 removes."""
+    """A .npy of the editor with one int8 per Gaussian of the scene: 1 adds it to the object, -1 removes it."""
     solidify: int = SolidifyOptions.iterations
-    """Steps that fit the object alone to its photographs, which makes it opaque and fine; 0 keeps its Gaussians."""
+    """Steps that fit the object alone to its photographs, to make it opaque and detailed; 0 keeps its Gaussians."""
     keep_open: bool = False
-    """Leave the side of the object open that no photograph shows; without it, it is closed."""
+    """Leave the unphotographed side of the object open; otherwise it is closed."""
     device: Device = "auto"
-    """Where to compute."""
+    """Device to compute on."""
     options: LiftOptions = field(default_factory=LiftOptions)
 
     def inputs(self) -> Inputs:
-        """The scene, the capture, the masks and what the user says of the object."""
+        """Return the scene, the capture, the masks, and the user's corrections and prompts."""
         capture = read_capture(self.capture)
         source = self._source(capture)
         if source == "files":
@@ -122,11 +122,11 @@ class Segment:
         return {"scene": (self.scene,), "weights": weights, **given, **files}
 
     def recorded_options(self) -> dict[str, Any]:
-        """The options, with the source of masks that `auto` stands for."""
+        """Return the options, with `auto` replaced by the source of masks that it chooses."""
         return plain_options(vars(self)) | {"mask_source": self._source(read_capture(self.capture))}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Make the object."""
+        """Write the object and the scene without it."""
         device = choose_device(self.device, context.console)
         scene = read_gaussians(self.scene).to(device)
         box = None if self.box is None else Box(torch.tensor(self.box[:3]), torch.tensor(self.box[3:]))
@@ -166,7 +166,7 @@ class Segment:
             np.save(stream, feature.cpu().numpy())
 
     def _source(self, capture: PosedImages) -> MaskSource:
-        """The source of masks that `auto` stands for."""
+        """Return the source of masks, with `auto` resolved."""
         if self.mask_source != "auto":
             return self.mask_source
         given = self.masks is not None or len(capture.with_masks()) == len(capture)
@@ -184,14 +184,14 @@ class Segment:
         if self.prompts is not None:
             prompts = prompts_by_view(capture, read_prompts(self.prompts), self.prompts)
         if self.mask_source == "auto":
-            context.console.say(f"{self.capture}: no masks for all images; they are cut by grabcut")
+            context.console.say(f"{self.capture}: not every image has a mask; masks are cut by grabcut")
         request = CutRequest(self._cutter(source), box, prompts)
         masks, region = cut_capture(capture, scene, request, progress=context.progress)
         masked = write_masks(made, capture, masks, region=region)
         size = " x ".join(f"{x:.3g}" for x in (region.box.upper - region.box.lower).tolist())
         context.console.say(f"the object was looked for in {region.reason}, a box of {size}")
         if not region.is_whole:
-            text = "what stands there goes on beyond that box, so a part of something may have been cut."
+            text = "the thing that stands there continues beyond that box, so only a part of it may have been cut."
             remedy = "Give clicks in two or three images (--prompts), or --box"
             context.console.tell(Note(text, "warning", remedy))
         return masked
@@ -206,7 +206,7 @@ class Segment:
     def _closed(
         self, object_: Gaussians, masked: MaskedViews, folder: Path, context: Context
     ) -> tuple[Gaussians, Bool[Tensor, "k"]]:
-        """The object with its unseen side closed, and which of its Gaussians do that."""
+        """Close the object's unseen side; also return which Gaussians close it."""
         views, small = _small_masks(masked)
         closed = close_unseen_side(object_, views, small)
         share = closed.guessed_share
@@ -228,7 +228,7 @@ class Segment:
     def _compare(
         self, masked: MaskedViews, scene: Gaussians, selection: Bool[Tensor, "n"], folder: Path, context: Context
     ) -> None:
-        """Measure how well the masks agree, and write it with a picture."""
+        """Measure how well the masks agree, and write the measure with a picture."""
         cameras, small = _small_masks(masked)
         agreement = measure_agreement(small, scene, cameras.to(scene.device), selection, progress=context.progress)
         with atomic_write(folder / AGREEMENT_FILE) as stream:
@@ -241,14 +241,14 @@ class Segment:
 
 
 def _small_masks(masked: MaskedViews) -> tuple[Cameras, Sequence[Tensor]]:
-    """The views at the size at which masks are cut, and their masks, read when asked for."""
+    """Return the views at the size at which masks are cut, and their masks, read on access."""
     cameras = masked.views.cameras.resized(min(1.0, CUT_SIDE_PX / int(masked.views.cameras.sizes.max())))
     sizes = cameras.sizes.tolist()
     return cameras, LazySequence(len(sizes), lambda index: resize(masked.masks[index], *sizes[index]))
 
 
 def _photographs(masked: MaskedViews) -> tuple[PosedImages, Sequence[tuple[Tensor, Tensor]]]:
-    """The views at the size at which the object is made solid, and their images and masks, read when asked for."""
+    """Return the views at the size for making the object solid, and their images and masks, read on access."""
     views = masked.views.limited(SOLID_SIDE_PX)
     sizes = views.cameras.sizes.tolist()
     read = LazySequence(len(sizes), lambda index: (views.image(index), resize(masked.masks[index], *sizes[index])))
@@ -256,12 +256,12 @@ def _photographs(masked: MaskedViews) -> tuple[PosedImages, Sequence[tuple[Tenso
 
 
 def _agreement_notes(agreement: Agreement, sheet: Path, picture: Path) -> list[Note]:
-    """How well the masks agree, and what is wrong with that; the `picture` will lie at `sheet`."""
+    """Describe how well the masks agree, and faults; the `picture` will be moved to `sheet`."""
     mean, names = agreement.mean, [Path(agreement.names[index]).name for index in agreement.doubtful]
     notes = [Note(f"the masks agree with the object by {mean:.0%}: {sheet}")]
     if mean < MIN_AGREEMENT:
         text = (
-            f"the masks of the images do not agree on one object: {mean:.0%} of it and them overlap, expected at least "
+            f"the masks of the images do not agree on one object: they overlap by {mean:.0%}, expected at least "
             f"{MIN_AGREEMENT:.0%}."
         )
         remedy = f"Look at {sheet}, then give clicks in two or three images (--prompts) or --box"
