@@ -136,6 +136,21 @@ def test_a_wall_beside_the_object_is_not_pressed():
     assert not same_bits(flattened, both)
 
 
+def test_the_vertical_edge_of_a_table_near_the_foot_keeps_every_bit():
+    end = 0.3
+    top = floor()
+    top = top.select(top.means[:, 0] < end)
+    y, z = torch.meshgrid(torch.linspace(-2, 2, 160), torch.linspace(-0.3, 0, 13), indexing="ij")
+    points = torch.stack([torch.full_like(y, end), y, z], -1).reshape(-1, 3)
+    edge = surfels(points, torch.tensor([[1.0, 0.0, 0.0]]).repeat(len(points), 1), width=0.03, thickness=THICKNESS)
+    table = concatenate([top, edge])
+    flattened = flatten_contact_layers(table, [box()])
+    moved = (flattened.means != table.means).any(1)
+    assert not bool(moved[top.count :].any())
+    under = (top.means[:, :2].abs() < 0.15).all(1)
+    assert float(moved[: top.count][under].float().mean()) > 0.9
+
+
 def test_a_leaf_that_lies_on_the_floor_and_two_objects_are_safe():
     leaf = surfels(ball().means * torch.tensor([1.0, 1.0, 0.001]), UP.repeat(4000, 1), width=0.01)
     far = ball(center=(1.2, 0.0))

@@ -22,8 +22,9 @@ from splatgraft.relighting import Light, LightSource, RelightOptions, relight
 from splatgraft.relighting.layers import LayerWeights, pasted
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.relighting.light.samples import sample_light
+from splatgraft.relighting.shading import irradiance
 from splatgraft.relighting.shadows import view_fit
-from splatgraft.relighting.shadows.scene_ratio import DARKEST, object_shadow_maps, scene_ratio
+from splatgraft.relighting.shadows.scene_ratio import DARKEST, light_sums, object_shadow_maps, scene_ratio
 from splatgraft.relighting.shadows.surface_views import GAMMA, gaussians_in_view
 from splatgraft.relighting.shadows.view_fit import _FittedView, _solved
 from splatgraft.rendering import render, view_operator
@@ -208,6 +209,20 @@ def test_an_even_sky_leaves_no_light_where_a_ball_touches_the_floor():
     truth = 1 - (1 + (away / RADIUS) ** 2) ** -1.5
     # 32 directions stand for the whole sky, so a cone of 0.35 rad covers a part of its rim only; and `darkest` remains
     torch.testing.assert_close(found, truth, rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("degrees", [60.0, 90.0, 100.6])
+def test_a_light_as_wide_as_a_half_space_or_wider_gives_scene_and_object_the_same_irradiance(degrees):
+    """A source of 90 degrees whose direction is uncertain by 90 has a softness of 100.6 degrees."""
+    samples = sample_light(from_above())
+    samples = replace(samples, softness=torch.full_like(samples.softness, math.radians(degrees)))
+    maps = object_shadow_maps(ball(), bounding_sphere(ball()), samples)
+    normals = even_directions(50)
+    shares = torch.ones(50, len(samples))
+    sums = (light_sums(maps, 3 * normals, normals, sample_visibility=shares, sources=part) for part in (True, False))
+    expected = irradiance(samples, normals, sample_visibility=shares)
+    # sums of 33 products in float32
+    torch.testing.assert_close(sum(sums)[0], expected, rtol=1e-5, atol=1e-5)
 
 
 SUN = torch.nn.functional.normalize(torch.tensor([0.5, -0.3, 0.8]), dim=0)

@@ -323,6 +323,9 @@ def test_highlights_of_the_old_light_go_where_it_is_known():
         # noise resembles some lobe by chance: at most a tenth of it becomes gloss
         assert left > 0.05 if kept else left < 0.1 * float(bands.abs().mean())
         assert torch.equal(relit.shaded(LayerWeights(gloss=0.0, shade=0.0)).sh[relit.is_object], shiny.sh)
+        if not kept:
+            doubled = relit.shaded(LayerWeights(gloss=2.0)).sh[relit.is_object, 1:]
+            assert torch.equal(doubled, 2 * relit.gloss[relit.is_object, 1:])  # no captured band comes back negative
 
 
 def test_places_without_light_or_object_give_the_plain_composite_and_a_reason():

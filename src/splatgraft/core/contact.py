@@ -1,10 +1,15 @@
-"""Contact of objects with what they stand on: around an object's foot the support's layer of Gaussians is flattened.
+"""Contact: flatten the layer of Gaussians that an object stands on, so that it does not cover the object's foot.
 
-A reconstructed floor or table is a layer of Gaussians as thick as its noise. Those of them that reach into the air are
-blended in front of an object that stands on it. The layer's plane is fitted by weighted least squares, and heights over
-it are scaled down, the more, the nearer to the foot. From straight above, a flattened layer looks the same.
+A reconstructed floor or table is a layer of Gaussians as thick as its noise. The upper ones are blended in front of an
+object that stands on it. For each object:
+
+1. Fit the layer's plane by weighted least squares to the Gaussians near the object (`_contact_layer`).
+2. Choose a factor on heights over the plane, smallest at the foot (`_factors`). Heights of a cup beside the foot or of
+   the vertical edge of a table keep the factor 1.
+3. Scale heights and shapes by the factor (`_flattened`). From straight above, a flattened layer looks the same.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,30 +23,19 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.planes import least_squares_normal
 from splatgraft.core.rotations import quaternion_from_rotation
 
-_OPAQUE = 0.1  # opacity above which a Gaussian counts as part of a surface, as for a bounding sphere
-_FIT_TOLERANCES = (0.4, 0.25, 0.2)  # object radii; distance from the plane of the Gaussians that each fit takes
-
 # what counts as a contact layer, and how far it is flattened; set by hand on rendered scenes
-_REACH = 0.35  # object radii: the plane is fitted to the target's Gaussians within this distance of the object's
-_NEIGHBOURS = 24  # gaussians whose centres and shapes give the normal of one; fewer in all are no contact layer
-_MAX_USED = 2000
-"""Gaussians of the target, and of the object, that the fit uses: even ones of the list, where there are more. Twice
-as many show where the scene is level."""
-_MAX_TILT = 0.5  # largest sine of the angle between the plane and the surface at a Gaussian that the plane is fitted to
-_MIN_SHARE = 0.25
-"""Smallest share of the surface within reach that lies on the plane; less, as in a bush, is no contact layer."""
-_TOP = 2.0  # standard deviations of the heights from the layer's middle to its top
-_DEEPEST = 3.0
-"""Standard deviations from the middle up to which a Gaussian belongs to the layer; an object whose base is higher
-floats."""
-_LEVEL = 0.5
-"""Standard deviations of the heights by which the mean of the Gaussians beside one in the plane may be off the
-middle; where it is off by one more, as at a book or a cup on the table, nothing is flattened."""
-_FOOT = 0.2  # object radii above its base up to which an object is its foot
-_SLOPE = 0.2
-"""Tangent of the elevation, 11 degrees, of the lowest camera from which the whole foot is visible: a flattened layer
-rises from the foot by this slope."""
-_FLATTEST = 0.2  # least factor on heights; measured: a flatter layer covers no less
+_OPAQUE = 0.1  # opacity above which a Gaussian is part of a surface, as for a bounding sphere
+_REACH = 0.35  # object radii; the plane is fitted to Gaussians within this distance of the object's
+_TOLERANCES = (0.4, 0.25, 0.2)  # object radii; largest distance from the plane in each round of the fit
+_NEIGHBOURS = 24  # Gaussians that give one normal of the fit, or the mean height beside a Gaussian
+_MAX_USED = 2000  # Gaussians of target and of object in the fit, spread evenly over the list
+_MIN_FACING = math.sqrt(0.75)  # cosine between a Gaussian's normal and the plane's: 30 degrees
+_DEEPEST = 3.0  # standard deviations from the layer's middle to its end; an object with a higher base floats
+_LEVEL = 0.5  # standard deviations by which the mean height beside a Gaussian may be off; one more: not flattened
+_SLOPE = (
+    0.2  # tangent; a flattened layer rises from the foot by 11 degrees, and lower cameras may see it cover the foot
+)
+_FLATTEST = 0.2  # smallest factor on heights; measured: a flatter layer covers no less
 
 
 @dataclass(frozen=True)
@@ -69,10 +63,10 @@ class _Layer:
 
 
 def flatten_contact_layers(target: Gaussians, objects: Sequence[Gaussians]) -> Gaussians:
-    """Flatten the layers that the placed objects stand on, so that they do not cover the objects' feet.
+    """Flatten the layers that placed objects stand on, so that they do not cover the objects' feet.
 
-    Gaussians away from every foot, and all around an object that floats or that stands on no surface, keep every bit;
-    of the others centres and shapes change, not opacities and colours.
+    Only centres and shapes near a foot change. All other Gaussians keep every bit. So does the whole target below an
+    object that floats or stands on no surface.
     """
     on_cpu = flattened = target.to("cpu")
     for one in objects:
@@ -83,7 +77,7 @@ def flatten_contact_layers(target: Gaussians, objects: Sequence[Gaussians]) -> G
 
 
 def _evenly(gaussians: Gaussians, count: int) -> Gaussians:
-    """At most `count` of some Gaussians, spread evenly over the list."""
+    """Select at most `count` Gaussians, spread evenly over the list."""
     if gaussians.count <= count:
         return gaussians
     return gaussians.select(torch.linspace(0, gaussians.count - 1, count).long())
@@ -102,9 +96,9 @@ def _flattened_under(target: Gaussians, opaque: Gaussians, sphere: BoundingSpher
     base = float((heights - layer.extents(opaque)).min())
     if base > _DEEPEST * layer.deviation:
         return target
-    # a foot that is buried deeper than the surface is known is so on purpose: no hole is dug for it
+    # no hole is dug for an object that was buried on purpose: deeper than the surface's height is uncertain
     base = max(base, -layer.deviation)
-    foot = opaque.select(heights < base + _FOOT * sphere.radius)
+    foot = opaque.select(heights < base + 0.2 * sphere.radius)
     factor = _factors(around, foot, layer, radius=sphere.radius)
     changed = (factor < 1).nonzero()[:, 0]
     flat = _flattened(around.select(changed), layer, factor[changed], level=min(base, 0.0))
@@ -122,33 +116,37 @@ def _flattened_under(target: Gaussians, opaque: Gaussians, sphere: BoundingSpher
 
 
 def _distance_from(foot: Gaussians, gaussians: Gaussians, layer: _Layer) -> Float[Tensor, "n"]:
-    """Distance of centres from a foot's rim in the layer's plane, world units; negative below the foot's Gaussians."""
+    """Compute in-plane distances of centres from the foot's rim, world units; negative below the foot."""
     tree = KDTree(layer.projected(foot.means).numpy())
     apart, nearest = tree.query(layer.projected(gaussians.means).numpy())
     return torch.from_numpy(apart).float() - foot.scales.median(1).values[torch.from_numpy(nearest)]
 
 
 def _factors(around: Gaussians, foot: Gaussians, layer: _Layer, *, radius: float) -> Float[Tensor, "n"]:
-    """Factors on the heights of n Gaussians: 1 away from the foot, outside of the layer, and where it is not bare."""
+    """Compute factors on the heights of n Gaussians; 1 leaves a Gaussian unchanged."""
     heights, deepest = layer.heights(around.means), _DEEPEST * layer.deviation
     in_layer = (heights.abs() < deepest) & (layer.extents(around) < deepest)
     free = _distance_from(foot, around, layer) - around.scales.max(1).values
-    factor = (_SLOPE * free / (_TOP * layer.deviation)).clamp(_FLATTEST, 1)
+    # the layer's top, two deviations above its middle, comes down to the slope
+    factor = (_SLOPE * free / (2 * layer.deviation)).clamp(_FLATTEST, 1)
     factor[~in_layer] = 1
     reached = (factor < 1).nonzero()[:, 0]
     standing = _evenly(around.select((heights > -deepest) & (heights < radius)), 2 * _MAX_USED)
-    if standing.count < _NEIGHBOURS:
+    if standing.count < 2 * _NEIGHBOURS:
         return torch.ones_like(factor)
     tree = KDTree(layer.projected(standing.means).numpy())
     beside = tree.query(layer.projected(around.means[reached]).numpy(), k=_NEIGHBOURS)[1]
     levels = layer.heights(standing.means)[torch.from_numpy(beside)].mean(1)
     uneven = (levels.abs() / layer.deviation - _LEVEL).clamp(0, 1)
-    factor[reached] = torch.maximum(factor[reached], uneven)
+    # twice the fit's neighbours: a single noisy normal would leave its Gaussian in front of the foot
+    normals = _normals(around.select(reached), standing, 2 * _NEIGHBOURS)
+    sideways = (normals @ layer.normal).abs() < _MIN_FACING
+    factor[reached] = torch.where(sideways, 1, torch.maximum(factor[reached], uneven))
     return factor
 
 
 def _contact_layer(around: Gaussians, opaque: Gaussians, sphere: BoundingSphere) -> _Layer | None:
-    """The layer next to an object's Gaussians that most of their surface belongs to; None where that is no surface."""
+    """Fit the layer that holds most of the surface near an object's Gaussians; None if there is no surface."""
     around = _evenly(around.select(around.opacities > _OPAQUE), 5 * _MAX_USED)
     if not around.count:
         return None
@@ -158,24 +156,23 @@ def _contact_layer(around: Gaussians, opaque: Gaussians, sphere: BoundingSphere)
     if near.count < _NEIGHBOURS:
         return None
     weights = near.opacities * near.scales.sort(1).values[:, 1:].prod(1)
-    normals = _normals(near, _NEIGHBOURS)
+    normals = _normals(near, near, _NEIGHBOURS)
     normal = normals[0]
     agreement = torch.ones_like(weights)
-    for _ in range(4):  # the axis that most normals are near to, of floor and wall the one with more Gaussians
+    for _ in range(4):  # the most frequent axis: of a floor and a wall, the one with more surface
         scatter = torch.einsum("n,ni,nj->ij", weights * agreement, normals, normals)
         normal = torch.linalg.eigh(scatter).eigenvectors[:, -1]
         agreement = (normals @ normal) ** 8
-    tolerances = [tolerance * sphere.radius for tolerance in _FIT_TOLERANCES]
-    facing = (normals @ normal).abs() > (1 - _MAX_TILT**2) ** 0.5
-    return _fitted_layer(near, weights, facing, normal, tolerances=tolerances)
+    facing = (normals @ normal).abs() > _MIN_FACING
+    return _fitted_layer(near, weights, facing, normal, radius=sphere.radius)
 
 
-def _normals(gaussians: Gaussians, neighbours: int) -> Float[Tensor, "n 3"]:
-    """Shortest axis of the covariance of each Gaussian's neighbours' centres and of its own; of either sign."""
-    near = KDTree(gaussians.means.numpy()).query(gaussians.means.numpy(), k=neighbours)[1]
-    centers = gaussians.means[torch.from_numpy(near)]
+def _normals(gaussians: Gaussians, among: Gaussians, count: int) -> Float[Tensor, "n 3"]:
+    """Compute normals of either sign: the shortest axis of the nearest centres' covariance plus the Gaussian's own."""
+    near = KDTree(among.means.numpy()).query(gaussians.means.numpy(), k=count)[1]
+    centers = among.means[torch.from_numpy(near)]
     offsets = centers - centers.mean(1, keepdim=True)
-    covariances = offsets.transpose(1, 2) @ offsets / neighbours + gaussians.covariances
+    covariances = offsets.transpose(1, 2) @ offsets / count + gaussians.covariances
     return torch.linalg.eigh(covariances).eigenvectors[:, :, 0]
 
 
@@ -185,20 +182,20 @@ def _fitted_layer(
     facing: Bool[Tensor, "n"],
     normal: Float[Tensor, "3"],
     *,
-    tolerances: Sequence[float],
+    radius: float,
 ) -> _Layer | None:
-    """The layer around the plane nearest to the Gaussians that face it, in repeated fits to those near the last one."""
+    """Fit a plane to the Gaussians that face it, in rounds that keep only those near the last plane."""
     means, weights = near.means.double(), weights.double()
     on_plane, middle = weights * facing, means.mean(0)
-    for tolerance in tolerances:
+    for tolerance in _TOLERANCES:
         levels = means @ normal.to(means)
-        on_plane = on_plane * ((levels - _median(levels, on_plane)).abs() < tolerance)
+        on_plane = on_plane * ((levels - _median(levels, on_plane)).abs() < tolerance * radius)
         if int((on_plane > 0).sum()) < _NEIGHBOURS:
             return None
         middle = on_plane @ means / on_plane.sum()
         offsets = means - middle
         normal = least_squares_normal(on_plane.sqrt()[:, None] * offsets).float()
-    if float(on_plane.sum()) < _MIN_SHARE * float(weights.sum()):
+    if float(on_plane.sum()) < 0.25 * float(weights.sum()):  # as in a bush: most of the surface lies elsewhere
         return None
     layer = _Layer(normal, float(middle.float() @ normal), 0.0)
     variances = layer.heights(near.means) ** 2 + layer.extents(near) ** 2
@@ -206,14 +203,14 @@ def _fitted_layer(
 
 
 def _median(values: Float[Tensor, "n"], weights: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Weighted median."""
+    """Compute the weighted median."""
     order = values.argsort()
     filled = weights[order].cumsum(0)
     return values[order[int((filled < 0.5 * filled[-1]).sum())]]
 
 
 def _flattened(gaussians: Gaussians, layer: _Layer, factor: Float[Tensor, "n"], *, level: float) -> Gaussians:
-    """Heights over the layer's middle scaled by `factor`, centres and shapes; what is scaled to 0 comes to `level`."""
+    """Scale heights over `level` and extents along the normal by `factor`."""
     heights = layer.heights(gaussians.means)
     shift = (1 - factor) * (level - heights)
     squash = torch.eye(3) - (1 - factor)[:, None, None] * torch.outer(layer.normal, layer.normal)

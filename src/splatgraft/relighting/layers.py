@@ -131,7 +131,7 @@ class Relit:
             color = spherical_harmonics.rgb_from_dc(self.gaussians.sh[sloped, 0])
             slope = _srgb_slope(color, ratio[sloped], weights.shadow * self.slope[sloped])
             sh[sloped, 1:4] += spherical_harmonics.band_from_slope(slope)
-        sh[self.bands_replaced, 1:] *= 1 - weights.gloss
+        sh[self.bands_replaced, 1:] *= max(1 - weights.gloss, 0.0)  # more gloss than 1 exaggerates the new one alone
         sh[glossy, : self.gloss.shape[1]] += weights.gloss * self.gloss[glossy]
         changed = replace(self.gaussians, sh=sh)
         catchers = (self.catcher_depth > 0).nonzero()[:, 0]

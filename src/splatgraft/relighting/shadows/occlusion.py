@@ -1,7 +1,7 @@
-"""Soft shadows of a compact object: irradiance with and without it, and the light that its unlit side sends on.
+"""Soft shadows of a compact object: irradiance at points with and without it, and the bounce of its unlit side.
 
 Percentage-closer soft shadows (Fernando 2005) from one prefiltered depth map per light sample: a blocker search gives
-the penumbra's width, a second filter of that width gives visibility.
+the penumbra's width, then a second filter of that width gives visibility.
 """
 
 from dataclasses import dataclass
@@ -21,14 +21,12 @@ from splatgraft.runtime.kernels import kernel, serialized
 # compiled into the kernel; all set by hand
 _COARSEST = 4  # pixels; width of the mip pyramid's last level
 _SEARCH_TAPS = 8  # taps of the blocker search
-_SOURCE_TAPS, _AMBIENT_TAPS = 24, 12
-"""Taps of the visibility filter: the noise of many ambient samples averages out, that of few sources does not."""
+_SOURCE_TAPS, _AMBIENT_TAPS = 24, 12  # taps of the visibility filter; over many ambient samples noise averages out
 _FEW_SAMPLES = 16  # fewer samples than this are taken for sources
-_SEARCH_GAP = 0.8  # distance between neighbouring taps of the search over the radius of its disk
-_BLUR = np.float32(1.5)  # A mip level is used up to a tap distance of this many of its pixels
-_WIDEST_CONE = np.float32(1.2)  # radians; wider cones are filtered as this one
-_GOLDEN_ANGLE = 2.399963
-"""Radians; rounded, and kept so: `core.directions.GOLDEN_ANGLE` would change results in the last bits."""
+_SEARCH_GAP = np.float32(0.8)  # distance between neighbouring taps of the search over the radius of its disk
+_BLUR = np.float32(1.5)  # pixels of a mip level; a larger distance between taps needs the next level
+_WIDEST_CONE = np.float32(1.2)  # radians; the filter of a wider cone stays this wide
+_GOLDEN_ANGLE = 2.399963  # radians; the exact `core.directions.GOLDEN_ANGLE` would change results in the last bits
 _MIN_ALPHA = 1e-4  # alpha below which a texel blocks nothing
 
 
@@ -45,8 +43,8 @@ class Occlusion:
     nearness: Float[Tensor, "k"]
     """One over the light's distance from the centre; 0 for directional samples."""
     texels: Float[Tensor, "k p 6"]
-    """All p texels, finest level first, premultiplied by alpha: alpha, depth of the lit side, depth of the middle,
-    linear rgb of the unlit side."""
+    """Alpha of all p texels, finest level first; then, premultiplied by it, depth of the lit side, depth of the middle
+    and linear rgb of the unlit side."""
     size: int
     """Width of the finest level, pixels."""
 
@@ -54,14 +52,14 @@ class Occlusion:
 def occlusion_from_maps(
     maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tensor, "k"], *, brightest: Float[Tensor, "k 3"]
 ) -> Occlusion:
-    """Mip pyramids of some depth maps.
+    """Build mip pyramids from an object's depth maps.
 
     Args:
-        maps: Of the object, with colour.
+        maps: Depth maps of the object, with colour.
         front: Position in `maps` of each sample's map.
         back: Position of the map from the opposite direction, which shows the unlit side (mirrored in u, depth
             negated).
-        brightest: Linear rgb radiance that the unlit side does not exceed.
+        brightest: Upper limit of the unlit side's linear rgb radiance.
     """
     alpha = maps.alpha[front]
     first = torch.where(maps.first < float(FAR) / 2, maps.first, maps.mean)
@@ -98,18 +96,18 @@ def occluded_irradiance(
     sample_visibility: Float[Tensor, "m k"],
     bias: float,
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
-    """Irradiance at points around an object: what compositing by differential rendering needs (Debevec 1998, Eq. 1).
+    """Compute irradiance around an object for differential rendering (Debevec 1998, Eq. 1).
 
     Args:
         occlusion: The object's k pyramids, one per sample.
         samples: The k samples of the light.
         points: World units.
-        normals: Unit, of the surface at each point.
+        normals: Unit normals of the surface at each point.
         sample_visibility: Share of each sample that the rest of the scene lets through, in [0, 1].
         bias: World units; an occluder nearer than this is the point's own surface.
 
     Returns:
-        Linear rgb irradiance without the object, with it, and what the object's unlit side adds.
+        Linear rgb irradiance without the object, with it, and from the object's unlit side.
     """
     arrays = [
         np.ascontiguousarray(t.numpy(), dtype=np.float32)
@@ -133,7 +131,7 @@ def occluded_irradiance(
 @kernel(fastmath=True, inline="always")
 @no_type_check
 def _soft_cosine(cosine, edge):
-    """Mean of max(0, cos) over a cone whose radius has the sine `edge`; as `shading.irradiance.soft_cosine`."""
+    """Compute the mean of max(0, cos) over a cone whose radius has the sine `edge`, as `shading.soft_cosine` does."""
     if cosine >= edge:
         return cosine
     if cosine <= -edge:
@@ -150,12 +148,13 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
     texel = 2 * radius / size
     search, taps = _SEARCH_TAPS, _SOURCE_TAPS if len(frames) < _FEW_SAMPLES else _AMBIENT_TAPS
     disk = np.empty((search + taps, 2), np.float32)  # Vogel spirals
-    search_gap, tap_gap = np.float32(_SEARCH_GAP), np.float32(2 / np.sqrt(taps))
+    search_gap, tap_gap = _SEARCH_GAP, np.float32(2 / np.sqrt(taps))
     for t in range(search + taps):
         count, j = (search, t) if t < search else (taps, t - search)
         r, angle = np.sqrt((j + 0.5) / count), j * _GOLDEN_ANGLE
         disk[t, 0], disk[t, 1] = r * np.cos(angle), r * np.sin(angle)
-    spreads, edges = np.tan(np.minimum(softness, _WIDEST_CONE)), np.sin(softness)
+    spreads = np.tan(np.minimum(softness, _WIDEST_CONE))
+    edges = np.sin(np.minimum(softness, np.float32(np.pi / 2)))  # a wider cone still ends at the horizon
     for i in prange(len(points)):
         x, y, z = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
         for k in range(len(frames)):
@@ -175,7 +174,7 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
             u = zoom * (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z)
             v = zoom * (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z)
             spread = spreads[k]
-            # change of the cosine over the cone: directions below the surface give no light
+            # the cosine changes over the cone, and directions below the surface give no light
             tilt_u = spread * (f[0, 0] * normals[i, 0] + f[0, 1] * normals[i, 1] + f[0, 2] * normals[i, 2])
             tilt_v = spread * (f[1, 0] * normals[i, 0] + f[1, 1] * normals[i, 1] + f[1, 2] * normals[i, 2])
             facing = np.float32(0)
@@ -229,7 +228,7 @@ def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (
             if facing > 0:
                 blocked, red, green, blue = blocked / facing, red / facing, green / facing, blue / facing
             blocked = min(blocked, np.float32(1))
-            # radiance of the unlit side over the solid angle it fills: of the sample's cone, pi * sin^2
+            # the unlit side's radiance times the projected solid angle of the sample's cone, pi * sin^2
             cone = np.float32(np.pi) * edges[k] ** 2
             for c in range(3):
                 out[1, i, c] += weight * (1 - blocked) * irradiance[k, c]

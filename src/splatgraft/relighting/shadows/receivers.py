@@ -316,7 +316,7 @@ def _layer(
     """Mean and standard deviation of the layer's height over each Gaussian's centre."""
     if not gaussians.count:
         return torch.zeros(0), torch.zeros(0)
-    near = nearest_neighbours(gaussians.means, count=count).long()
+    near = nearest_neighbours(gaussians.means, count=count)
     heights = ((gaussians.means[near] - gaussians.means[:, None]) * normals[:, None]).sum(-1)
     own = ((torch.einsum("nij,ni->nj", gaussians.rotations, normals) * gaussians.scales) ** 2).sum(1)
     return heights.mean(1), (heights.var(1, correction=0) + own[near].mean(1)).sqrt()
