@@ -1,4 +1,4 @@
-"""Pictures of a scene's surface from its depth map: inverse depth in colours, and the directions that surfaces face.
+"""Pictures of a scene's surface from a depth map: inverse depth in colours, and normals in colours.
 
 Normals are central differences of the pixels' points in the camera frame, after a median filter of inverse depth.
 """
@@ -25,9 +25,9 @@ _FAR_TO_NEAR = torch.tensor(
         [0.993, 0.906, 0.144],
     ]
 )  # sRGB; every 32nd colour of viridis (van der Walt and Smith, CC0), whose lightness rises evenly
-_FAR_QUANTILE, _NEAR_QUANTILE = 0.02, 0.98  # of inverse depth; few pixels beyond them get the end colours
-_MEDIAN_PX = 5  # window; neighbouring pixels see the planes of different Gaussians, whose depths differ a little
-_STEP = 0.05  # of the inverse depth; a surface that bends by more from pixel to pixel is two; set by hand
+_FAR_QUANTILE, _NEAR_QUANTILE = 0.02, 0.98  # of inverse depth; pixels beyond them get the end colours
+_MEDIAN_PX = 5  # window; neighbouring pixels see planes of different Gaussians, whose depths differ a little
+_STEP = 0.05  # share of the inverse depth; a surface that bends by more between pixels counts as two; set by hand
 _OPENGL_FROM_OPENCV = torch.tensor([1.0, -1.0, -1.0])  # y and z of the camera frame change their signs
 
 

@@ -1,4 +1,4 @@
-"""Harmonization of rendered views: an image model corrects the light on an inserted object, one view at a time."""
+"""Harmonisation of rendered views: an image model corrects the light on an inserted object, one view at a time."""
 
 from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize, render_views
 from splatgraft.harmonization.interface import (
