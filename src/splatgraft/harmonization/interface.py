@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -50,15 +50,6 @@ class Harmonizer(Protocol):
         ...
 
 
-@runtime_checkable
-class NoisyStartHarmonizer(Protocol):
-    """A harmoniser that can start from a partly noisy image, which later iterative updates use (paper, ablations)."""
-
-    def harmonize_from(self, view: HarmonizerInputs, strength: float) -> Harmonized:
-        """Harmonise `view`, conditioned on its composite, starting from its prior at a noise level in (0, 1]."""
-        ...
-
-
 @dataclass(frozen=True)
 class HarmonizerContext:
     """Device and workload of a harmoniser."""
@@ -73,12 +64,3 @@ class HarmonizerContext:
     """Noise levels in (0, 1] from which views will be started."""
     say: Callable[[str], None] = lambda sentence: None
     """Function that takes messages for the user, one line each."""
-
-
-def noise_levels(schedule: Literal["linear", "geometric"], updates: int) -> tuple[float, ...]:
-    """Noise that each of several harmonisations starts from: from 1 to 0.1 with equal differences or equal ratios.
-
-    Paper: section Ablations, Iterative Dataset Update. The first starts from noise alone.
-    """
-    steps = [number / max(updates - 1, 1) for number in range(updates)]
-    return tuple(1 - 0.9 * step if schedule == "linear" else 0.1**step for step in steps)
