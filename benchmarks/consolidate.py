@@ -12,6 +12,7 @@ held-out RMSE.
 import argparse
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -30,6 +31,7 @@ from splatgraft.formats import read_capture, read_gaussians, write_gaussians
 from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import render
 from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
+from splatgraft_paper.consolidation import PaperDescent, descend_as_paper
 
 ROOT = Path(__file__).parents[1]
 LOSSES: dict[str, ImageLoss] = {"fourier": windowed_fourier, "l1-dssim": l1_dssim, "l1": l1}
@@ -126,15 +128,15 @@ def compare_methods(problem: Problem, loss: ImageLoss, iterations: int) -> str:
     options = ConsolidateOptions(loss=loss, view_error=False)
     consolidate(problem.composite, problem.cameras[:2], problem.images[:2], options)  # compiles the kernels
     runs = {
-        "fast": options,
-        "fast with tint and flow per view (the default)": ConsolidateOptions(loss=loss),
-        "paper": replace(options, method="paper", iterations=iterations),
+        "fast": partial(consolidate, options=options),
+        "fast with tint and flow per view (the default)": partial(consolidate, options=ConsolidateOptions(loss=loss)),
+        "paper": partial(descend_as_paper, settings=PaperDescent(loss, iterations)),
     }
     results = {}
-    for name, choice in runs.items():
+    for name, run in runs.items():
         reset_peak_memory()
         wall, cpu = time.perf_counter(), time.process_time()
-        scene = consolidate(problem.composite, problem.cameras, problem.images, choice)
+        scene = run(problem.composite, problem.cameras, problem.images)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         error = problem.errors(scene, loss)
         results[name] = (wall, cpu, peak_memory_bytes() / 2**20, *error)

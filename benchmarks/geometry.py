@@ -32,6 +32,7 @@ from splatgraft.core.image_metrics import psnr
 from splatgraft.core.images import read_mask, write_image
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.evaluation import depth_colors, normal_colors, normals_from_depth
+from splatgraft.evaluation.geometry_pictures import inverse_depth, normals_by_differences
 from splatgraft.formats import read_capture
 from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import render
@@ -112,22 +113,17 @@ def _neighbourhood(known: Bool[Tensor, "h w"], width: int) -> Float[Tensor, "h w
 
 
 def normals_of_depth(depth: Float[Tensor, "h w"], camera: Cameras) -> Float[Tensor, "h w 3"]:
-    """Unit normals towards the camera, in its axes, from differences of unprojected points; 0 where depth is unknown.
+    """Compute unit normals towards the camera, in its axes; 0 where depth is unknown.
 
     A float16 depth has steps of up to a thousandth, often more than its change from pixel to pixel. So inverse depth,
-    which is linear in the pixels of a plane, is averaged in a box first, rendered and true alike; unknown pixels are
-    left out. The true depth of a bare table then gives its normal to 0.4 degrees in the median.
+    which is linear in the pixels of a plane, is averaged in a box first, in rendered and in true depth; unknown pixels
+    are left out. The true depth of a bare table then gives its normal to 0.4 degrees in the median.
     """
     known = depth > 0
-    inverse = torch.where(known, 1 / torch.where(known, depth, 1), 0)
     share = _neighbourhood(known, _SMOOTHED_PX)
-    mean = functional.avg_pool2d(inverse[None], _SMOOTHED_PX, 1, _SMOOTHED_PX // 2)[0] / share.clamp_min(1e-6)
-    points = camera.rays() / mean.clamp_min(1e-6)[..., None]
-    across, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
-    # x to the right, y downwards: down x across points back to the camera
-    normals = functional.normalize(torch.linalg.cross(down, across), dim=-1)
-    facing = torch.where((normals * points[1:-1, 1:-1]).sum(-1, keepdim=True) > 0, -normals, normals)
-    return functional.pad(facing, (0, 0, 1, 1, 1, 1)) * known[..., None]
+    inverse = functional.avg_pool2d(inverse_depth(depth)[None], _SMOOTHED_PX, 1, _SMOOTHED_PX // 2)[0]
+    normals = normals_by_differences(inverse / share.clamp_min(1e-6), camera)
+    return functional.pad(normals, (0, 0, 1, 1, 1, 1)) * known[..., None]
 
 
 def normal_error_deg(

@@ -179,9 +179,9 @@ def paper_adam(setting: Setting) -> list[Row]:
     """Measure the paper's consolidation (its section 6): the time of a step, and of 10,000."""
     from paper_size import Size, scene_of
 
-    from splatgraft.consolidation import ConsolidateOptions, consolidate
     from splatgraft.fitting.perceptual_losses import lpips_vgg
     from splatgraft.rendering import render
+    from splatgraft_paper.consolidation import PaperDescent, descend_as_paper
 
     size = Size(4, 48, 32, 600) if setting.toy else Size(40, 704, 496, 300_000)
     composite, cameras, _ = scene_of(size)
@@ -196,9 +196,8 @@ def paper_adam(setting: Setting) -> list[Row]:
         loss = lpips_vgg(Path(folder))
     times = []
     for steps in (2, 4) if setting.toy else (50, 350):
-        options = ConsolidateOptions(method="paper", loss=loss, iterations=steps)
         begin = time.perf_counter()
-        consolidate(scene, cameras, images, options)
+        descend_as_paper(scene, cameras, images, PaperDescent(loss, iterations=steps))
         setting.synchronize()
         times.append((time.perf_counter() - begin, steps))
     step = (times[1][0] - times[0][0]) / (times[1][1] - times[0][1])

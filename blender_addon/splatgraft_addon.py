@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blender add-on: insert an object from a Gaussian splat capture into another one, lit by its new place.
 
-It only calls the command line (`splatgraft capture`, `adopt`, `relight`, `light`) in the background, and imports what
-that wrote. Everything of the target hangs on one empty, in whose local axes the target's capture is: as that empty is
-moved, turned or scaled, splats and lamps go with it.
+It calls the command line (`splatgraft capture`, `adopt`, `relight`, `light`) in the background and imports the files
+that it writes. Everything of the target has one empty as its parent. The local axes of the empty are those of the
+target's capture, so that splats and lamps follow when it is moved, turned or scaled.
 """
 
 import itertools
@@ -30,25 +30,20 @@ bl_info = {
     "category": "Import-Export",
 }
 
-_SH_C0 = 0.28209479177387814
-"""Spherical harmonic of degree 0, which turns f_dc into colour."""
-_NATIVE_SPLATS = (5, 3, 0)
-"""First Blender whose own .ply importer makes Gaussian splats."""
-_STRAY = 1.0
-"""Percent of an object's points on either side that its box may leave out."""
-_RIGID = 1e-3
-"""Largest difference of an axis's scale from the mean, and cosine between axes, that are no shear."""
-_SECONDS = 0.5
-"""Between two looks at the running command."""
+_SH_C0 = 0.28209479177387814  # spherical harmonic of degree 0, the factor from f_dc to colour
+_NATIVE_SPLATS = (5, 3, 0)  # first Blender whose own .ply importer makes Gaussian splats
+_STRAY = 1.0  # percent of an object's points, on either side, that its box may leave out
+_RIGID = 1e-3  # largest relative difference of an axis's scale, and cosine between axes, that are rounding
+_SECONDS = 0.5  # between two checks of the running command
 
 
 class Job:
-    """Commands that run one after another in the background; what they say goes to a log whose last line is shown."""
+    """Commands that run one after another in the background; the panel shows the last line of their log."""
 
     running: "Job | None" = None
 
     def __init__(self, commands, log, done):
-        """Start `commands`, lists of words, of which each begins when the one before it succeeded; then `done()`."""
+        """Run `commands`, lists of words, one after another until one fails; after the last one call `done`."""
         self.commands, self.log, self.done, self.process = list(commands), log, done, None
         log.parent.mkdir(parents=True, exist_ok=True)
         log.write_text("")
@@ -57,7 +52,7 @@ class Job:
 
     @staticmethod
     def poll():
-        """What the timer calls: the seconds to the next call, or None at the end."""
+        """Advance the running job, as Blender's timer; gives the seconds to the next call, or None at the end."""
         job, state = Job.running, bpy.context.scene.splatgraft
         if job is None:
             return None
@@ -82,7 +77,7 @@ class Job:
             if code != 0:
                 raise RuntimeError(state.status.removeprefix("splatgraft: "))
         if not self.commands:
-            # a timer has no window, which importers ask for
+            # importers need a window, which a timer does not have
             with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
                 state.status = self.done()
             return False
@@ -91,20 +86,20 @@ class Job:
         return True
 
     def stop(self):
-        """End the running command; what it had begun is thrown away, and earlier results stay."""
+        """End the running command; its unfinished result is discarded, and earlier results stay."""
         Job.running = None
         if self.process is not None and self.process.poll() is None:
             self.process.terminate()
 
 
 class Settings(bpy.types.PropertyGroup):
-    """What the panel asks for, stored in the .blend."""
+    """Settings of the panel, stored in the .blend."""
 
     command: StringProperty(
         name="Command", subtype="FILE_PATH", default="splatgraft", description="splatgraft's program"
     )
     source: StringProperty(
-        name="Object", subtype="FILE_PATH", description="A splatgraft project whose object it is, or an object's .ply"
+        name="Object", subtype="FILE_PATH", description="A splatgraft project, for its object, or an object's .ply"
     )
     target: StringProperty(
         name="Target", subtype="FILE_PATH", description="A trained scene (.ply, .spz, .glb, ...), or a project's folder"
@@ -119,7 +114,7 @@ class Paths:
     """The files that the settings name."""
 
     def __init__(self, settings):
-        """Find them; a ValueError where one is missing."""
+        """Find the files; ValueError if one is missing."""
         self.command = shutil.which(bpy.path.abspath(settings.command)) or shutil.which(settings.command)
         if self.command is None:
             raise ValueError(f"Command: expected the program splatgraft, found no {settings.command}")
@@ -147,7 +142,7 @@ class Paths:
         self.map, self.lamps = self.folder / "light.hdr", self.folder / "light.json"
 
     def preparing(self):
-        """The commands that give a scene without a capture its cameras, and a .ply in their axes."""
+        """Return the commands that make cameras for a scene without a capture, and a .ply in their axes."""
         given, made = str(self.given_target), self.target.parent
         if not self.is_trained_elsewhere:
             return []
@@ -157,7 +152,7 @@ class Paths:
         ]
 
     def relighting(self):
-        """The commands that give the object its new light, and write that light."""
+        """Return the commands that relight the object and write the light."""
         common = ["--placement", str(self.placement), "--cameras", str(self.cameras)]
         relight = [self.command, "relight", "--target", str(self.target), *common, "--out", str(self.relit.parent)]
         if self.knows_source:
@@ -167,12 +162,12 @@ class Paths:
 
 
 def find(part):
-    """The object that has this part in the scene: root, target, object, box, relit; None where there is none."""
+    """Find the Blender object of a part: root, target, object, box, relit; None if it is missing."""
     return next((thing for thing in bpy.context.scene.objects if thing.get("splatgraft") == part), None)
 
 
 def import_splats(path, part):
-    """Import a Gaussian .ply as `part`, in its own axes, by the best that is installed; gives it and what it is."""
+    """Import a Gaussian .ply as `part`, in its own axes, by the best installed importer; gives it and its kind."""
     before = set(bpy.data.objects)
     kiri = next((name for name in dir(bpy.ops.sna) if name.startswith("dgs_render_import_ply")), None)
     if bpy.app.version < _NATIVE_SPLATS and kiri is not None:
@@ -184,9 +179,9 @@ def import_splats(path, part):
     thing = next(new for new in bpy.data.objects if new not in before)
     if said == "Blender's splats" and thing.type == "MESH":
         _show_as_points(thing)
-        said = "coloured points, as neither Blender 5.3 nor the add-on KIRI 3DGS Render is here"
+        said = "coloured points, because neither Blender 5.3 nor the add-on KIRI 3DGS Render is here"
     thing.name, thing["splatgraft"] = f"splatgraft {part}", part
-    # meshes get their light from map and lamps alone, which what the splats show would block or add to
+    # the map and the lamps light meshes; the splats must not block that light or add to it
     thing.visible_shadow = thing.visible_diffuse = thing.visible_glossy = thing.visible_transmission = False
     return thing, said
 
@@ -228,7 +223,7 @@ def _positions(thing):
 
 
 def upright_from_capture(cameras):
-    """The smallest rotation (4x4) that turns a capture's up, the mean of its cameras', to +z; -y is up without any."""
+    """Compute the smallest rotation (4x4) from a capture's up, the mean of its cameras', to +z; the default is -y."""
     up = Vector((0.0, -1.0, 0.0))
     if cameras.is_file():
         frames = json.loads(cameras.read_text())["frames"]
@@ -242,7 +237,7 @@ def _remove(*parts):
 
 
 def show_parts(paths):
-    """Import target and object, upright, the object in a box that is moved in its stead; gives what is said."""
+    """Import target and object, upright, with a box that moves the object; gives a message for the panel."""
     _remove("root", "target", "object", "box", "relit", "lamp")
     root = bpy.data.objects.new("splatgraft target frame", None)
     root["splatgraft"] = "root"
@@ -252,7 +247,7 @@ def show_parts(paths):
     target.parent = root
     thing, _ = import_splats(paths.object, "object")
     low, high = np.percentile(_positions(thing), [_STRAY, 100 - _STRAY], axis=0)
-    # a turned box is drawn around the turned points; it is the object's frame, with its origin in the middle
+    # the box surrounds the upright points; its frame is the object's, with the origin in the middle
     middle = Matrix.Translation(Vector(0.5 * (low + high)))
     inner = upright_from_capture(paths.object_cameras if paths.knows_source else Path()) @ middle.inverted()
     points = _positions(thing) @ np.array(inner.to_3x3()).T + np.array(inner.translation)
@@ -273,7 +268,7 @@ def show_parts(paths):
 
 
 def target_from_object():
-    """Scale, rotation (3x3) and translation of the object in the target's capture; a ValueError where it is no such."""
+    """Compute scale, rotation (3x3) and translation of the object in the target's capture; ValueError if sheared."""
     root, thing = find("root"), find("object")
     if root is None or thing is None:
         raise ValueError("Relight: expected a target and an object in the scene, found none; press Load first")
@@ -285,7 +280,7 @@ def target_from_object():
         raise ValueError(
             "Relight: expected one scale for all axes of the box and no mirroring, found another transform"
         )
-    # the nearest rotation, as Blender's numbers are of single precision
+    # the nearest rotation, because Blender has single precision
     left, _, right = np.linalg.svd(axes)
     return scale, left @ right, matrix[:3, 3]
 
@@ -299,7 +294,7 @@ def write_placement(paths):
 
 
 def show_result(paths):
-    """Import the relit scene in place of its parts, the lamps and the world; gives what is said."""
+    """Import the relit scene in place of its parts, the lamps and the world; gives a message for the panel."""
     _remove("relit", "lamp")
     root = find("root")
     relit, said = import_splats(paths.relit, "relit")
@@ -315,7 +310,7 @@ def show_result(paths):
 
 
 def _add_lamp(lamp, root, place):
-    """A sun, or for a lamp at a distance a ball of light, in the root's axes."""
+    """Add a sun, or a ball of light for a lamp at a distance, in the root's axes."""
     towards, away = Vector(lamp["direction"]), lamp.get("distance")
     strength, radius = max(lamp["irradiance"]), math.radians(lamp.get("angular_radius_deg", 0.0))
     light = bpy.data.lights.new(f"splatgraft {lamp['name']}", "SUN" if away is None else "POINT")
@@ -334,7 +329,7 @@ def _add_lamp(lamp, root, place):
 
 
 def _set_world(path, root):
-    """The environment map as the scene's world, turned as the root is."""
+    """Make the environment map the scene's world, turned as the root is."""
     world = bpy.data.worlds.get("splatgraft") or bpy.data.worlds.new("splatgraft")
     bpy.context.scene.world, world.use_nodes = world, True
     nodes, links = world.node_tree.nodes, world.node_tree.links
@@ -351,7 +346,7 @@ def _set_world(path, root):
 
 
 class SPLATGRAFT_OT_load(bpy.types.Operator):
-    """Show target and object; a scene without a capture is first looked at from all around"""
+    """Show target and object; for a scene without a capture, cameras all around it are made first"""
 
     bl_idname, bl_label = "splatgraft.load", "Load"
 
@@ -360,7 +355,7 @@ class SPLATGRAFT_OT_load(bpy.types.Operator):
 
 
 class SPLATGRAFT_OT_relight(bpy.types.Operator):
-    """Give the object the light of the place where its box is, and the place the object's shadow"""
+    """Give the object the light at the place of its box, and the place the object's shadow"""
 
     bl_idname, bl_label = "splatgraft.relight", "Relight"
 
@@ -369,7 +364,7 @@ class SPLATGRAFT_OT_relight(bpy.types.Operator):
 
 
 class SPLATGRAFT_OT_stop(bpy.types.Operator):
-    """End what runs"""
+    """End the running command"""
 
     bl_idname, bl_label = "splatgraft.stop", "Stop"
 
@@ -383,7 +378,7 @@ class SPLATGRAFT_OT_stop(bpy.types.Operator):
 def _begin(operator, context, commands, done):
     try:
         if Job.running is not None:
-            raise ValueError("expected nothing that runs, found a command; wait, or press Stop")
+            raise ValueError("a command is running; wait, or press Stop")
         paths = Paths(context.scene.splatgraft)
         paths.folder.mkdir(parents=True, exist_ok=True)
         Job(commands(paths), paths.folder / "splatgraft.log", lambda: done(paths))

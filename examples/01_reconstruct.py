@@ -1,4 +1,4 @@
-"""Reconstruct a 3DGS scene from a posed capture and render it. Few steps and small images: it takes seconds."""
+"""Reconstruct a 3DGS scene from a posed capture and render it; with few steps and small images it takes seconds."""
 
 import tempfile
 from pathlib import Path

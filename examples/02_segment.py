@@ -1,4 +1,4 @@
-"""Take an object out of its scene by 2D masks of it."""
+"""Take an object out of its scene by its 2D masks."""
 
 from pathlib import Path
 

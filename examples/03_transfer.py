@@ -1,4 +1,4 @@
-"""The whole transfer: an object of one capture in another one's scene, lit by it, in all views, and measured.
+"""Transfer an object of one capture into the scene of another: composition, light, harmonisation, measurement.
 
 The benchmark scene has a ground truth, and both of its captures share world coordinates. For captures of your own,
 `sg.place_object` finds a place (05_several_objects.py).

@@ -1,4 +1,4 @@
-"""A project from Python: run its steps up to one, and see which are stale and why."""
+"""Run the steps of a project from Python, up to one of them, and list stale steps with reasons."""
 
 import tempfile
 from pathlib import Path
@@ -27,7 +27,7 @@ def main() -> None:
     print(f"the object: {sg.load(folders['segment'] / 'object.ply').count} Gaussians in {folders['segment']}")
     print("still to do:", sg.stale_steps(project))
 
-    # an option was changed: what depends on it is stale, and the next run does it again
+    # a changed option makes the steps that depend on it stale; the next run repeats them
     project.write_text(PROJECT.replace("solidify = 40", "solidify = 0"))
     print("stale now:", sg.stale_steps(project)["segment"])
 

@@ -1,4 +1,4 @@
-"""Two objects of two captures in one scene: each is placed where it fits, and all light and shade each other."""
+"""Place two objects of two captures in one scene; they light and shade each other."""
 
 import tempfile
 from pathlib import Path
@@ -19,7 +19,7 @@ def main() -> None:
         source = sg.read_capture(folder).resized(0.25)
         cut = sg.segment(sg.reconstruct(source, SHORT), source, solidify=sg.SolidifyOptions(iterations=40))
         sources.append(sg.SourceScene(cut.surroundings, source.cameras))
-        # the scene with the objects before it, so that each finds a place of its own; both captures are in metres
+        # with the earlier objects in the scene each finds a place of its own; both captures are in metres
         scene, _ = composite.merged()
         placed = sg.place_object(
             scene,

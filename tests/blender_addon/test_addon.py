@@ -66,7 +66,9 @@ def points(values: object) -> np.ndarray:
 def test_loaded_parts_are_upright_and_said_to_be_points(used, finished_project: Path):
     found, _ = used
     assert "Target: expected a scene or a project with target/scene" in found["refused"]
-    assert found["loaded"].startswith("coloured points, as neither Blender 5.3 nor the add-on KIRI 3DGS Render is here")
+    assert found["loaded"].startswith(
+        "coloured points, because neither Blender 5.3 nor the add-on KIRI 3DGS Render is here"
+    )
     for name in ("target", "bare"):
         # the floor is level and below, seen from given or generated cameras
         low = np.percentile(points(found[name])[:, 2], [5, 50])
@@ -131,6 +133,6 @@ def test_a_glb_opens_in_the_axes_of_the_world_frame(used):
 def test_what_cannot_be_done_is_said_in_one_line(used):
     found, _ = used
     assert "expected one scale for all axes of the box and no mirroring" in found["sheared"]
-    assert "expected nothing that runs, found a command" in found["while it runs"]
+    assert "a command is running; wait, or press Stop" in found["while it runs"]
     assert "expected a PLY file that starts with 'ply', found b'no scene'" in found["failed"]
     assert found["failed"].startswith("failed: ")

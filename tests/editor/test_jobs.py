@@ -158,8 +158,8 @@ def test_a_job_writes_what_the_command_writes(result: Session, tmp_path: Path) -
     assert main([*job.command[:3], str(tmp_path / "b.sog"), *job.command[4:]]) == 0
     assert to.read_bytes() == (tmp_path / "b.sog").read_bytes()
     assert job.command[4:] == ("--layer", "object-with-shadow")
-    # assumptions first, then size and time
-    assert "black over what lies behind" in job.said[0]
+    # what was assumed, then size and time
+    assert "black Gaussians that darken the picture behind them" in job.said[0]
     assert job.said[-1].startswith(f"{to}: 0.0 MB in ")
     assert sharing.written_exports(result.files) == (to,)
 

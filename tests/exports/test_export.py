@@ -3,6 +3,7 @@
 import json
 import re
 import zipfile
+from collections import Counter
 from dataclasses import replace
 
 import cv2
@@ -232,8 +233,26 @@ def test_the_object_with_its_shadow_are_both_and_steps_are_counted(source, tmp_p
     relit = parts()["relit"]
     assert torch.equal(both.means[: relit.count], relit.means)
     assert both.count > relit.count
-    assert re.search(r"black over what lies behind, of \d+ Gaussians; .* \d+\.\d dB from the scene", said[0])
+    assert re.search(r"the shadow has \d+ black Gaussians that darken .* \d+\.\d dB PSNR in views outside", said[0])
     assert [one[:2] for one in told] == [(step + 1, len(told)) for step in range(len(told))]
+
+
+@pytest.mark.parametrize("count", [9, 18])
+def test_a_shadow_is_fitted_to_all_views_alike(source, monkeypatch, count):
+    """Of 9 cameras 7 are fitted, of 18 cameras 14."""
+    assert source.cameras is not None
+    seen: Counter[tuple[float, ...]] = Counter()
+
+    def watched(scene, camera, **options):
+        if scene.opacity_logits.requires_grad:
+            seen[tuple(camera.centers[0].tolist())] += 1
+        return render(scene, camera, **options)
+
+    monkeypatch.setattr("splatgraft.exports.shadow_layer.render", watched)
+    cameras = path_around(source, first_view(source)[0], frames=count, width=64)
+    assert shadow_layer(replace(source, cameras=cameras)).psnr is not None
+    assert len(seen) == count - count // 4
+    assert max(seen.values()) - min(seen.values()) <= 1
 
 
 def test_no_shadow_is_said_and_a_shadow_needs_cameras(source):

@@ -15,14 +15,13 @@ from splatgraft.harmonization import (
     FluxOptions,
     HarmonizerContext,
     HarmonizerInputs,
-    NoisyStartHarmonizer,
     make_harmonizer,
 )
 from splatgraft.harmonization.flux.loading import BASE, FluxFolder
 from splatgraft.harmonization.flux.network import Autoencoder, velocity
 from splatgraft.harmonization.flux.prompt import prompt_file
 from splatgraft.harmonization.flux.sampling import noise
-from splatgraft.harmonization.interface import noise_levels
+from splatgraft_paper.consolidation import NoisyStartHarmonizer, noise_levels
 
 pytestmark = list(quiet)
 WIDE = CHANNELS * 12

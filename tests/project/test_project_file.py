@@ -87,7 +87,7 @@ def test_every_table_and_key_is_described() -> None:
     tables = {table.name: table for table in project_keys()}
     assert list(tables) == ["source", "target", *(kind.__name__.lower() for kind in STEPS)]
     keys = {key.name: key for key in tables["consolidate"].keys}
-    assert (keys["method"].type, keys["method"].default) == ('"fast" or "paper"', '"fast"')
+    assert (keys["nuisance"].type, keys["nuisance"].default) == ('"tint-flow" or "none"', '"tint-flow"')
     assert keys["scene"].default == '"relit/scene.ply"'
     assert keys["passes"].meaning
     flux = next(variant for variant in tables["harmonize"].variants if variant.name == "flux")

@@ -201,7 +201,7 @@ def test_nothing_to_draw_gives_the_background():
 def test_reading_an_output_that_was_not_asked_for_is_refused():
     picture = rendering.render(random_scene(5, 0, seed=0), camera(), outputs=frozenset())
     for name in ("color", "depth", "normal", "features"):
-        with pytest.raises(ValueError, match=f"render: expected {name} among what was asked for, found none"):
+        with pytest.raises(ValueError, match=f"render: expected {name} among the requested outputs, found none"):
             getattr(picture, name)
 
 

@@ -1,10 +1,11 @@
-"""Compose: place objects in a target scene, by given transforms or on a surface found for them."""
+"""Composition: places objects in a target scene, by given transforms or on a surface that is found for them."""
 
 from splatgraft.composition.coverage import Coverage
 from splatgraft.composition.object_base import ObjectBase, object_base, rest_on_surface
 from splatgraft.composition.placement import Placed, PlaceOptions, compose, place_object
-from splatgraft.composition.places import NoFreePlaceError, Suggestion, hidden_fraction, suggest_places
+from splatgraft.composition.places import NoFreePlaceError, Suggestion, suggest_places
 from splatgraft.composition.support_surface import Support, support_below
+from splatgraft.composition.visibility import hidden_fraction
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.composite import Composite, PlacedObject
 

@@ -1,4 +1,7 @@
-"""Base of an object, from weighted quantiles and the surface it was captured on, and its pose on another surface."""
+"""Estimates the base of an object, and the pose in which the base rests on a surface of another scene.
+
+The base comes from weighted quantiles of the object's Gaussians and, where it was seen, from the surface under them.
+"""
 
 import math
 from dataclasses import dataclass
@@ -16,32 +19,32 @@ from splatgraft.core.similarity import Similarity
 
 @dataclass(frozen=True)
 class ObjectBase:
-    """Where an object touches the ground and how large it is, in the frame of its own capture."""
+    """Foot, up direction and size of an object, in the frame of its own capture."""
 
     point: Float[Tensor, "3"]
-    """Below the object's middle, at the level of the ground."""
+    """Point below the object's middle, at the level of the ground."""
     up: Float[Tensor, "3"]
-    """Unit; the normal of the surface it was captured on where that was found."""
+    """Unit normal of the surface that it was captured on, or the up direction if no surface was found."""
     height: float
-    """From the base to the top, world units."""
+    """Height of the top above the base, world units."""
     radius: float
     """Horizontal reach from the middle, world units."""
     stands_on: str
-    """Source of the base: "surface" (of its own capture) or "extent" (lowest parts of the object)."""
+    """Source of the base: "surface" (in its own capture) or "extent" (lowest parts of the object)."""
 
 
 # set by hand; shares of the object's weight
-_HEIGHT_TRIM = 0.01  # beyond its lowest and its highest level
-_MIDDLE_TRIM = 0.02  # beyond either end of its horizontal extent, whose middle is taken
+_HEIGHT_TRIM = 0.01  # beyond the lowest and the highest level
+_MIDDLE_TRIM = 0.02  # beyond either end of the horizontal extent, whose middle is taken
 _WITHIN_RADIUS = 0.97
 # lengths over the object's height or radius
-_SEARCH_HEIGHT = 0.3  # height above the lowest part from which the ground is searched downwards
-_DISC_RADIUS = 2.0  # radius of the searched disc: nothing was seen under the object, so its surroundings count
+_SEARCH_HEIGHT = 0.3  # start of the search for the ground, above the lowest part
+_DISC_RADIUS = 2.0  # radius of the searched disc: the surroundings count, because the ground under it was not seen
 _MAX_RISE = 0.1
-"""Largest height of the ground above the lowest part: masks that take more of the ground are rare, and what hangs on a
-wall has edges of other things beside it that look like ground."""
-_MAX_GAP = 0.25  # largest depth of the ground below the lowest part: masks do not miss more of a foot
-_MIN_FLAT = 0.25  # least share of the disc that lies on the ground
+"""Largest height of the ground above the lowest part. Masks rarely take more of the ground, and beside an object that
+hangs on a wall the edges of other things look like ground."""
+_MAX_GAP = 0.25  # largest depth of the ground below the lowest part: masks miss no more of a foot
+_MIN_FLAT = 0.25  # smallest share of the disc that lies on the ground
 
 
 def object_base(
@@ -50,7 +53,7 @@ def object_base(
     up: Float[Tensor, "3"],
     surroundings: Gaussians | None = None,
 ) -> ObjectBase:
-    """Base of `object_`, on its own ground where `surroundings` show that, otherwise at its lowest parts."""
+    """Estimate the base of `object_`: on its own ground if `surroundings` show that, otherwise at its lowest parts."""
     if object_.count == 0:
         raise ValueError("placement: expected an object with Gaussians, found an empty one")
     up = torch.nn.functional.normalize(up.to(object_.means), dim=0)
@@ -75,7 +78,7 @@ def object_base(
 
 
 def _on_own_surface(base: ObjectBase, surroundings: Gaussians) -> ObjectBase:
-    """The base moved to the ground around the object; unchanged where there is none near its lowest part."""
+    """Move the base to the ground around the object, if there is ground near its lowest part."""
     start = base.point + _SEARCH_HEIGHT * base.height * base.up
     try:
         radius = _DISC_RADIUS * base.radius
@@ -90,7 +93,7 @@ def _on_own_surface(base: ObjectBase, surroundings: Gaussians) -> ObjectBase:
 
 
 def _quantile(values: Float[Tensor, "n"], weight: Float[Tensor, "n"], share: float) -> Float[Tensor, ""]:
-    """Weighted quantile."""
+    """Compute the weighted quantile of `values` at `share`."""
     order = values.argsort()
     filled = weight[order].double().cumsum(0)
     index = int(torch.searchsorted(filled, share * filled[-1]))
@@ -106,10 +109,21 @@ def rest_on_surface(
     scale: float = 1.0,
     yaw_deg: float = 0.0,
 ) -> tuple[Similarity, Support]:
-    """`target_from_object` that rests `base` on the surface below `point`, along its normal, and that surface.
+    """Compute the pose that rests an object on the surface below a point, upright along the surface's normal.
 
-    `scale`: size in the target over size in the object's own capture. `yaw_deg`: about the surface's normal,
-    counterclockwise seen from above. A ValueError where no surface lies below.
+    Args:
+        target: The scene with the surface.
+        base: The object's base.
+        point: Point above the surface, world units.
+        up: The target's up direction.
+        scale: Size in the target over size in the object's own capture.
+        yaw_deg: Rotation about the surface's normal, counterclockwise seen from above.
+
+    Returns:
+        `target_from_object`, and the surface.
+
+    Raises:
+        ValueError: No surface lies below the point.
     """
     support = support_below(target, point, up=up, radius=scale * base.radius)
     yaw = rotation_about(support.normal, math.radians(yaw_deg))

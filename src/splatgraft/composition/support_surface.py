@@ -1,6 +1,7 @@
-"""The level surface below a point of a scene: the most frequent level of a height map, refined by least squares.
+"""Finds the level surface below a point of a scene: the most frequent height of a height map, with a fitted plane.
 
-The height map is the median depth from straight above, without what lies over a given level.
+The height map is the median depth from straight above, without Gaussians above a given level. The plane is fitted by
+least squares to points that are ever nearer to it.
 """
 
 from dataclasses import dataclass
@@ -18,12 +19,12 @@ _CAMERA_DISTANCE = 24.0  # distance of the camera over the radius: rays are vert
 
 @dataclass(frozen=True)
 class HeightMap:
-    """s x s heights of the topmost surface around a point."""
+    """Heights of the topmost surface around a point, s x s pixels."""
 
     points: Float[Tensor, "s s 3"]
-    """Surface points, in the world; meaningless where alpha is 0."""
+    """Surface points, world units; undefined where alpha is 0."""
     heights: Float[Tensor, "s s"]
-    """Along `up` above the map's centre, world units."""
+    """Heights along `up` above the map's centre, world units."""
     alpha: Float[Tensor, "s s"]
     """Opacity of the scene seen from above, in [0, 1]."""
     offsets: Float[Tensor, "s s 2"]
@@ -31,7 +32,7 @@ class HeightMap:
     pixel: float
     """Width of a pixel, world units."""
     camera: Cameras
-    """The camera straight above that the map was drawn with."""
+    """The camera straight above, by which the map was drawn."""
 
 
 def height_map(
@@ -43,9 +44,9 @@ def height_map(
     top: float,
     size: int = 96,
 ) -> HeightMap:
-    """The s x s height map, s = `size`, of the square of half width `radius` around `center`.
+    """Compute the height map, `size` x `size` pixels, of the square of half width `radius` around `center`.
 
-    Gaussians centred more than `top` above `center`, along `up`, are left out; all in world units.
+    Gaussians whose centre is more than `top` above `center`, along `up`, are left out; all lengths are in world units.
     """
     center, up = center.to(scene.means), torch.nn.functional.normalize(up.to(scene.means), dim=0)
     distance = _CAMERA_DISTANCE * radius
@@ -75,18 +76,16 @@ def height_map(
 
 # lengths over the radius of the disc, set by hand
 _MAX_SLOPE = 0.35  # sine of the largest slope that counts as level: 20 degrees, mainly for errors of the estimated up
-_CLEARANCE = 0.25  # height above the point from which the surface is searched downwards, where it is not given
+_CLEARANCE = 0.25  # height above the point from which the surface is searched downwards, if none is given
 _DISC_SIZE_PX = 64  # width and height of the height map
 _MIN_PIXELS = 8  # solid pixels of the height map below which there is no surface
-_WIDENED = (1.0, 2.0, 4.0)
-"""Radii of the discs, over the given one, until one has a surface: the place may be a hole in the scene."""
+_WIDENED = (1.0, 2.0, 4.0)  # radii of the discs, over the given one, tried in turn: the point may lie over a hole
 _LEVEL_STEP = 0.05  # width of a bin of the histogram of heights
 _TOLERANCES = (0.3, 0.2, 0.12, 0.08, 0.06, 0.06)
-"""Distance from the plane of the points that each fit takes: from 20 degrees of slope to surface noise."""
-_ON_SURFACE = 0.06  # largest distance of a point from the plane that is fitted to it
-_LEVEL = 0.15
-"""Distance from the plane within which ground is level, folds of a cloth included; what is higher obstructs."""
-_MAX_ERROR = 0.12  # bound on the distance of a point when a sloped plane is compared with a level one
+"""Largest distance from the plane of the points in each fit: from a slope of 20 degrees down to surface noise."""
+_ON_SURFACE = _TOLERANCES[-1]  # largest distance of a point from the level plane that is fitted to it
+_LEVEL = 0.15  # distance from the plane within which ground is level, folds of a cloth included; higher things obstruct
+_MAX_ERROR = 0.12  # bound on the distance of a point in the comparison of a sloped plane with a level one
 _SLOPE_GAIN = 0.7  # largest error of the sloped plane over that of the level one; a slope that explains less is noise
 
 
@@ -95,9 +94,9 @@ class Support:
     """A level plane that can carry an object."""
 
     point: Float[Tensor, "3"]
-    """On the plane, straight below the given point."""
+    """Point of the plane straight below the given point, world units."""
     normal: Float[Tensor, "3"]
-    """Unit, upwards."""
+    """Unit normal, upwards."""
     flat_fraction: float
     """Share of the disc around it that lies at the plane's level, in [0, 1]."""
     obstructed_fraction: float
@@ -112,11 +111,20 @@ def support_below(
     radius: float,
     clearance: float | None = None,
 ) -> Support:
-    """The surface that fills most of a horizontal disc of `radius` below `point`, level as far as one is.
+    """Find the level surface that fills most of a horizontal disc below a point.
 
-    It may be poor, as on a heap of things or a steep slope: `flat_fraction` says how much of the disc lies on it. What
-    is higher than `clearance` above `point`, such as a lamp, is ignored; None takes a share of the radius, so that a
-    point on a noisy surface finds it. A ValueError where no surface lies below.
+    On a heap of things or a steep slope the surface is poor, and its `flat_fraction` low.
+
+    Args:
+        scene: The scene with the surface.
+        point: Point above the surface, world units.
+        up: The scene's up direction.
+        radius: Radius of the disc, world units; doubled at most twice if there is a hole below the point.
+        clearance: Height above the point, world units, over which things such as a lamp are ignored. None takes a
+            quarter of the radius, so that a point on a noisy surface finds it.
+
+    Raises:
+        ValueError: No surface lies below the point.
     """
     up = torch.nn.functional.normalize(up.to(scene.means), dim=0)
     point = point.to(scene.means)
@@ -124,7 +132,7 @@ def support_below(
     for factor in _WIDENED:
         ground = height_map(scene, point, up=up, radius=factor * radius, top=top, size=_DISC_SIZE_PX)
         disc = ground.offsets.norm(dim=-1) <= factor * radius
-        # what is half transparent is a floater or an edge
+        # half transparent pixels are floaters or edges
         solid = disc & (ground.alpha > 0.5)
         if int(solid.sum()) >= _MIN_PIXELS:
             break
@@ -149,7 +157,7 @@ def _fit_level_plane(
     up: Float[Tensor, "3"],
     radius: float,
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
-    """The normal of the most frequent level and its distance along it from the origin."""
+    """Fit a plane to the most frequent level; gives its normal and its distance from the origin along the normal."""
     step = _LEVEL_STEP * radius
     # a moving sum of five bins: noise and a slight slope spread one surface over several
     counts = torch.bincount(((heights - heights.min()) / step).long())

@@ -1,4 +1,4 @@
-"""Consolidation: fit the colours of a composite to independently harmonised views (paper, Multi-View Consolidation)."""
+"""Consolidation: fits the colours of a composite to harmonised views (paper, Multi-View Consolidation)."""
 
 from splatgraft.consolidation.color_fit import consolidate
 from splatgraft.consolidation.options import ConsolidateOptions, ImageSequence

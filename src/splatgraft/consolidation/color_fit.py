@@ -1,7 +1,10 @@
 """Consolidation: fits the SH colours of a composite to independently harmonised views; geometry and opacity stay.
 
-Two methods: the paper's gradient descent (section Multi-View Consolidation), and least squares by normal equations on
-what the harmoniser changed, followed by a short descent.
+The paper (section Multi-View Consolidation) descends on LPIPS; here least squares do most of the work:
+
+1. Find the pixels that the harmoniser changed and the Gaussians on them; the others stay.
+2. Solve normal equations for the colours, with each view's tint and flow (`normal_equations`, `view_errors`).
+3. Descend for a few passes on windowed Fourier magnitudes, which keep texture where views disagree.
 """
 
 import math
@@ -23,31 +26,27 @@ from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, sile
 
 # set by hand
 _CHANGED_SHARE = 0.02  # share of a Gaussian's blending weight on changed pixels above which it is active
-_VISIBLE_SHARE = 1.0 / 255
-"""Share of a pixel that active Gaussians make up, from which it lies in the window: one grey level."""
-_MARGIN_PX = 16  # border of the windows, so that windowed losses and SSIM see the surroundings
-
+_VISIBLE_SHARE = 1.0 / 255  # active Gaussians' share of a pixel above which it lies in the window: one grey level
+_MARGIN_PX = 16  # border of the windows, so that windowed losses see the surroundings
 _SAVE_EVERY = 500  # iterations of a descent between two checkpoints
 
 
 @dataclass(frozen=True)
-class _Rates:
+class Rates:
     """Learning rates of Adam on the colours."""
 
     first: float
     """Step size of band 0."""
     rest_ratio: float
-    """That of the higher bands over that of band 0."""
+    """Step size of the higher bands over that of band 0."""
     final_ratio: float
-    """The last over the first, approached along a cosine."""
+    """Last step size over the first, approached along a cosine."""
 
 
-_PAPER = _Rates(first=0.0025, rest_ratio=0.05, final_ratio=1.0)
-"""3DGS's feature_lr and its 1/20, constant as in the paper."""
-_POLISH = _Rates(first=0.03, rest_ratio=0.1, final_ratio=0.02)
+_POLISH = Rates(first=0.03, rest_ratio=0.1, final_ratio=0.02)
 
 
-def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services of every long stage
+def consolidate(
     composite: Gaussians,
     cameras: Cameras,
     images: ImageSequence,
@@ -55,25 +54,23 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
     *,
     weights: ImageSequence | None = None,
     progress: Progress = silent,
-    checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
     """Fit the colours of a scene (all SH bands) to harmonised images of it; geometry and opacity stay.
 
-    Paper: section Multi-View Consolidation. Higher bands start from zero. With the method `fast`, Gaussians that no
-    changed pixel sees keep their colours exactly. The same inputs and seed give the same result.
+    Paper: section Multi-View Consolidation. Higher bands start from zero. Gaussians that no changed pixel sees keep
+    their colours exactly. Equal inputs and seeds give equal results.
 
-    Memory above the inputs, for n Gaussians with k coefficients: 4 n (k^2 + 50 k) bytes for `fast`, 4 n 24 k for
-    `paper`, plus up to `options.cache_bytes` (views, then their corrected images, are kept until it is full), the tile
-    lists of two views and a few images; beyond that it does not grow with the number of views.
+    For n Gaussians with k coefficients, the memory above the inputs is 4 n (k^2 + 50 k) bytes, the tile lists of two
+    views, a few images, and up to `options.cache_bytes` for views and their corrected images. It does not grow further
+    with the number of views.
 
     Args:
         composite: The scene of which the images were made.
         cameras: v cameras, on the device of `composite`.
         images: v harmonised images (h, w, 3), sRGB in [0, 1], each of its camera's size, read one at a time.
-        options: Method, loss, nuisance parameters and rates.
-        weights: Confidence of every pixel, v images (h, w) in [0, 1]; 1 everywhere where not given.
+        options: Loss, errors of views, and length of the descent.
+        weights: Confidence of every pixel, v images (h, w) in [0, 1]; 1 by default.
         progress: Called with steps done, steps in all and a short text.
-        checkpoint: Where `paper` saves its state and from where it continues.
 
     Returns:
         The scene with the fitted colours.
@@ -82,17 +79,9 @@ def consolidate(  # noqa: PLR0913 - three inputs, options, and the two services 
         ValueError: There is no camera or not one image per camera, or an image has another size than its camera or
             numbers that are not finite.
     """
-    _check_counts(cameras, images, weights)
+    check_counts(cameras, images, weights)
     views = Views(composite, cameras, images, weights=weights, options=options)
-    if options.method == "paper":
-        begin = composite.sh if options.continued else drop_higher_bands(composite.sh)
-        descent = _Descent(_PAPER, options.iterations, options.image_loss, options.seed, checkpoint)
-        targets = CorrectedTargets(views, estimated=False)
-        return replace(composite, sh=optimize_colors(begin, targets, descent, progress))
-    return _consolidate_fast(composite, restrict_to_changes(views, options.unchanged_below), options, progress)
-
-
-def _consolidate_fast(composite: Gaussians, views: Views, options: ConsolidateOptions, progress: Progress) -> Gaussians:
+    views = restrict_to_changes(views, options.unchanged_below)
     if len(views) == 0:
         return composite
     active = slice(None) if views.active is None else views.active
@@ -101,14 +90,15 @@ def _consolidate_fast(composite: Gaussians, views: Views, options: ConsolidateOp
     sh = solve(prior, targets, progress=progress)
     targets.keep()
     if options.polish_passes:
-        descent = _Descent(_POLISH, options.polish_passes * len(views), options.image_loss, options.seed)
+        descent = Descent(_POLISH, options.polish_passes * len(views), options.loss, options.seed)
         sh = optimize_colors(sh, targets, descent, progress)
     colors = composite.sh.clone()
     colors[active] = sh
     return replace(composite, sh=colors)
 
 
-def _check_counts(cameras: Cameras, images: ImageSequence, weights: ImageSequence | None) -> None:
+def check_counts(cameras: Cameras, images: ImageSequence, weights: ImageSequence | None) -> None:
+    """Raise ValueError unless there are views, with one image and one weight each."""
     if len(cameras) == 0:
         raise ValueError("consolidate: expected at least one view, found none")
     for kind, sequence in (("image", images), ("weight", weights)):
@@ -118,9 +108,10 @@ def _check_counts(cameras: Cameras, images: ImageSequence, weights: ImageSequenc
 
 @torch.no_grad()
 def restrict_to_changes(views: Views, unchanged_below: float) -> Views:
-    """The views cropped to what the harmoniser changed, with the Gaussians that no changed pixel sees fixed.
+    """Crop the views to the changed pixels, and fix the Gaussians that no changed pixel sees.
 
-    A difference from the composite's render, in sRGB, below `unchanged_below` is no change; 0 or less gives `views`.
+    A pixel is changed if it differs by `unchanged_below` or more, in sRGB, from the composite's render; 0 or less gives
+    `views` themselves.
     """
     if unchanged_below <= 0:
         return views
@@ -155,28 +146,28 @@ def _window(views: Views, index: int, active: Bool[Tensor, "n"]) -> Window | Non
 
 
 def drop_higher_bands(sh: Float[Tensor, "n k 3"]) -> Float[Tensor, "n k 3"]:
-    """Coefficients with bands above 0 set to zero (paper, section Multi-View Consolidation)."""
+    """Set the bands above 0 to zero (paper, section Multi-View Consolidation)."""
     return torch.cat([sh[:, :1], torch.zeros_like(sh[:, 1:])], 1)
 
 
 @dataclass(frozen=True)
-class _Descent:
-    """How colours descend."""
+class Descent:
+    """Settings of a gradient descent on the colours."""
 
-    rates: _Rates
+    rates: Rates
     iterations: int
-    """Steps, one view each."""
+    """Number of steps, one view each."""
     loss: ImageLoss
     seed: int
-    """Of the order of views."""
+    """Seed of the order of views."""
     checkpoint: Checkpoint = field(default_factory=NoCheckpoint)
-    """Where the state is saved every 500 iterations."""
+    """Storage of the state, which is saved every 500 iterations."""
 
 
 def optimize_colors(
-    sh: Float[Tensor, "m k 3"], targets: CorrectedTargets, descent: _Descent, progress: Progress
+    sh: Float[Tensor, "m k 3"], targets: CorrectedTargets, descent: Descent, progress: Progress
 ) -> Float[Tensor, "m k 3"]:
-    """Colours after steps of Adam over views in shuffled order; only visible Gaussians change."""
+    """Descend on the colours by Adam over views in shuffled order; a step changes only visible Gaussians."""
     views, start, iterations, checkpoint = targets.views, 0, descent.iterations, descent.checkpoint
     sh = sh.clone().contiguous()
     moments = adam.no_moments({"sh": sh}, len(sh))
@@ -205,20 +196,20 @@ def optimize_colors(
 
 
 def _view_of(iteration: int, count: int, seed: int) -> int:
-    """The view of an iteration: each pass visits all views in an order that depends on seed and pass only."""
+    """Choose the view of an iteration: each pass visits all views, in an order that depends on seed and pass only."""
     order = torch.randperm(count, generator=torch.Generator().manual_seed(seed * 1_000_003 + iteration // count))
     return int(order[iteration % count])
 
 
 def _decay(done: float, final_ratio: float) -> float:
-    """Factor on the learning rate after the share `done` of all iterations: half a cosine from 1 to `final_ratio`."""
+    """Compute the factor on the learning rate after the share `done` of all steps: a cosine from 1 to `final_ratio`."""
     return final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 def _weighted_pair(
     picture: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], weight: Float[Tensor, "h w"] | None
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]]:
-    """Both images blended by confidence with the detached render, so that any loss ignores pixels of weight 0."""
+    """Blend both images by confidence with the detached render, so that any loss ignores pixels of weight 0."""
     if weight is None:
         return picture, target
     share, constant = weight[..., None], picture.detach()

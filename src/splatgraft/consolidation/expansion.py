@@ -1,6 +1,6 @@
-"""The linear map from SH coefficients to colours towards one view, and its transposes, for the Gaussians it shows.
+"""The linear map from SH coefficients to colours towards one view, and its transpose, for the Gaussians it shows.
 
-On the CPU numba kernels evaluate the basis for each Gaussian in turn: nothing of the size of the coefficients is made.
+On the CPU numba kernels evaluate the basis of one Gaussian at a time, without an array of the coefficients' size.
 """
 
 import math
@@ -27,16 +27,16 @@ class Expansion:
     """Spherical harmonics of m Gaussians towards one camera."""
 
     means: Float[Tensor, "m 3"]
-    """World units; shared by all views."""
+    """Centres, world units; shared by all views."""
     center: Float[Tensor, "3"]
-    """Centre of the camera."""
+    """Centre of the camera, world units."""
     shown: Int[Tensor, "s"]
-    """Gaussians with weight in the view, ascending int32; the maps are 0 for the others."""
+    """Indices of the Gaussians with weight in the view, ascending int32; the map is 0 for the others."""
     degree: int
     """Degree of the harmonics."""
 
     def colors(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m 3"]:
-        """The sum of harmonics times coefficients."""
+        """Compute the sum of harmonics times coefficients."""
         out = sh.new_zeros(len(sh), 3)
         if self._on_cpu:
             _fill_colors(*self._numbers, sh.contiguous().numpy(), out.numpy())
@@ -45,7 +45,7 @@ class Expansion:
         return out
 
     def add_transpose(self, colors: Float[Tensor, "m 3"], out: Float[Tensor, "m k 3"]) -> None:
-        """Add the transpose of `colors` at some colours to `out`."""
+        """Apply the transpose of the map to `colors` and add the result to `out`."""
         if self._on_cpu:
             _add_transpose(*self._numbers, colors.contiguous().numpy(), out.numpy())
         else:
@@ -59,9 +59,10 @@ class Expansion:
         moments: adam.Moments,
         rates: Float[Tensor, "3*k"],
     ) -> bool:
-        """One step of `adam.step` on the coefficients that are shown, along the transpose of the gradient by colours.
+        """Take one step of `adam.step` on the shown coefficients, given the gradient by colours.
 
-        Changes `sh` and the moments of the field "sh" in place. False where a gradient was not finite; such rows stay.
+        It changes `sh` and the moments of the field "sh" in place. It returns False if a gradient was not finite; such
+        rows stay.
         """
         if self._on_cpu:
             flat = tuple(x.view(len(x), -1).numpy() for x in (sh, moments.first["sh"], moments.second["sh"]))
@@ -74,7 +75,7 @@ class Expansion:
         return adam.step({"sh": sh}, {"sh": gradient}, moments=moments, rates={"sh": rates}, visible=visible)
 
     def add_squares(self, weights: Float[Tensor, "m 1"], out: Float[Tensor, "m k k"]) -> None:
-        """Add weight times harmonics times their transpose of every Gaussian to `out`."""
+        """Add weight times harmonics times their transpose, for every Gaussian, to `out`."""
         if self._on_cpu:
             _add_squares(*self._numbers, weights.contiguous().numpy(), out.numpy())
         else:
@@ -155,7 +156,7 @@ def _add_squares(means, center, shown, weights, out):
 @kernel(parallel=True)
 @no_type_check
 def _descend(seen, colors, rows, steps, rates):
-    """`_add_transpose` and `adam.update_row` without a gradient in memory; returns how many rows are not finite."""
+    """Apply `_add_transpose` and `adam.update_row` row by row; returns the number of rows that are not finite."""
     (means, center, shown), (values, firsts, seconds) = seen, rows
     n, k = shown.shape[0], rates.shape[0] // 3
     bad = 0

@@ -1,4 +1,4 @@
-"""Views of a composite with frozen geometry: the linear map from colours to pixels, cached within a byte budget.
+"""Views of a composite with frozen geometry: linear maps from colours to pixels, cached within a budget of bytes.
 
 The active Gaussians may change colour; the others are blended once into a constant image per view. Target images are
 read lazily.
@@ -26,55 +26,55 @@ class View:
     """The affine map from the colours of m active Gaussians to the pixels of one view."""
 
     operator: ViewOperator
-    """From the values of all n Gaussians to pixels."""
+    """Linear map from the values of all n Gaussians to pixels."""
     expansion: Expansion
-    """From coefficients of the active Gaussians to their colours towards the view."""
+    """Linear map from the coefficients of the active Gaussians to their colours towards the view."""
     static: Float[Tensor, "h w 3"] | None
-    """Image of the other Gaussians and the background; None where that is zero."""
+    """Image of the other Gaussians and the background; None if it is zero."""
     active: Int[Tensor, "m"] | None
-    """Indices of the active Gaussians; None where all n are active."""
+    """Indices of the active Gaussians; None if all n are active."""
 
     @property
     def visible(self) -> Bool[Tensor, "m"]:
-        """Which active Gaussians have weight in the view."""
+        """Whether each active Gaussian has weight in the view."""
         return self.operator.visible if self.active is None else self.operator.visible[self.active]
 
     @property
     def own_bytes(self) -> int:
-        """Memory that no other view shares."""
+        """Bytes of this view alone, without parts that views share."""
         return sum(memory_bytes(part) for part in (self.operator, self.static, self.expansion.shown))
 
     def colors(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m 3"]:
-        """The colours towards this view, not clamped; one half where the view shows nothing."""
+        """Compute the colours towards this view, not clamped; one half for Gaussians that the view does not show."""
         return self.expansion.colors(sh) + 0.5
 
     def blend(self, colors: Float[Tensor, "m c"]) -> Float[Tensor, "h w c"]:
-        """The linear part: active Gaussians over black."""
+        """Blend the active Gaussians over black: the linear part."""
         return self.operator.blend(self._of_all(colors))
 
     def render(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "h w 3"]:
-        """The image, with colours clamped at zero as every 3DGS renderer does."""
+        """Render the image, with colours clamped at zero as every 3DGS renderer does."""
         return self.draw(self.colors(sh))
 
     def draw(self, colors: Float[Tensor, "m 3"]) -> Float[Tensor, "h w 3"]:
-        """The image of colours, clamped at zero; differentiable."""
+        """Draw the image of colours, clamped at zero; differentiable."""
         picture = self.blend(colors.clamp_min(0))
         return picture if self.static is None else picture + self.static
 
     def blend_transpose(self, image: Float[Tensor, "h w c"]) -> Float[Tensor, "m c"]:
-        """The transpose of `blend`."""
+        """Apply the transpose of `blend`."""
         values = self.operator.blend_transpose(image)
         return values if self.active is None else values[self.active]
 
     def blend_and_transpose(
         self, colors: Float[Tensor, "m 3"], weights: Float[Tensor, "h w"] | None
     ) -> Float[Tensor, "m 3"]:
-        """`blend`, then pixels times `weights` where given, then `blend_transpose`."""
+        """Apply `blend`, multiply the pixels by `weights` if given, and apply `blend_transpose`."""
         values = self.operator.blend_and_transpose(self._of_all(colors), weights)
         return values if self.active is None else values[self.active]
 
     def _of_all(self, colors: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
-        """The colours among zeros of the Gaussians that are not active."""
+        """Spread colours to all Gaussians; those that are not active get 0."""
         if self.active is None:
             return colors
         values = colors.new_zeros(len(self.operator.visible), colors.shape[1])
@@ -97,7 +97,7 @@ class Views:
         weights: ImageSequence | None,
         options: ConsolidateOptions,
     ) -> None:
-        """All Gaussians are active and all pixels count."""
+        """Make the views; all Gaussians are active and all pixels count."""
         self.composite, self.cameras, self.images, self.weights = composite, cameras, images, weights
         self.options = options
         self.active: Tensor | None = None
@@ -109,9 +109,9 @@ class Views:
         return len(self.cameras)
 
     def restricted(self, active: Bool[Tensor, "n"], windows: Sequence[Window | None]) -> "Views":
-        """The same views with some Gaussians active, cropped to `windows`, and without those whose window is None.
+        """Make views with only some Gaussians active, cropped to `windows`; views whose window is None are dropped.
 
-        The cache goes to the new views, as far as they are not cropped.
+        Cached views that are not cropped move to the new cache.
         """
         chosen = [i for i, window in enumerate(windows) if window is not None]
         kept = [window for window in windows if window is not None]
@@ -133,7 +133,7 @@ class Views:
         return restricted
 
     def __getitem__(self, index: int) -> View:
-        """The view's map, from the cache or built anew."""
+        """Return the view's map, from the cache or built anew."""
         if index in self._cached:
             return self._cached[index]
         operator = view_operator(
@@ -148,7 +148,7 @@ class Views:
             self._cached[index] = view
 
     def take_bytes(self, count: int) -> bool:
-        """Whether the cache has room for so many more bytes, which then count as taken."""
+        """Reserve bytes of the cache; False if it has no room for them."""
         has_room = self._cached_bytes + count <= self.options.cache_bytes
         self._cached_bytes += count if has_room else 0
         return has_room
@@ -166,7 +166,7 @@ class Views:
         return View(operator=operator, expansion=expansion, static=static, active=self.active)
 
     def _fixed(self, operator: ViewOperator, camera: Cameras, behind: Tensor | None) -> Tensor | None:
-        """What the Gaussians that are not active add to the image; None where neither they nor `behind` are seen."""
+        """Blend the Gaussians that are not active over `behind`; None if there is neither."""
         fixed = operator.visible.clone()
         fixed[self.active] = False
         which = torch.nonzero(fixed).flatten()
@@ -180,11 +180,11 @@ class Views:
         return others if behind is None else behind + others
 
     def target(self, index: int) -> Float[Tensor, "h w 3"]:
-        """The harmonised image of a view."""
+        """Read the harmonised image of a view."""
         return self._sized(self.images[index], index, "image")
 
     def weight(self, index: int) -> Float[Tensor, "h w"] | None:
-        """The confidence in each pixel of a view in [0, 1], None where all count fully."""
+        """Read the confidence in each pixel of a view, in [0, 1]; None if all pixels count fully."""
         return None if self.weights is None else self._sized(self.weights[index], index, "weight")
 
     def _sized(self, image: Tensor, index: int, kind: str) -> Tensor:
@@ -206,7 +206,7 @@ def _cropped(images: ImageSequence, chosen: list[int], windows: list[Window]) ->
 
 
 def memory_bytes(value: object) -> int:
-    """Bytes of all tensors and arrays in a value and its fields."""
+    """Add up the bytes of all tensors and arrays in a value and its fields."""
     if isinstance(value, Tensor):
         return value.numel() * value.element_size()
     if isinstance(value, np.ndarray):

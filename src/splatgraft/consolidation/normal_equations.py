@@ -1,8 +1,12 @@
-"""Least squares for SH colours by block-preconditioned conjugate gradient on the views' fixed maps.
+"""Solves least squares for SH colours by block-preconditioned conjugate gradient on the views' fixed maps.
 
-With geometry frozen a pixel is a fixed weighted sum of colours, and a colour a fixed weighted sum of SH coefficients:
-sum_v |W_v B_v x - image_v|^2 + ridge |x - prior|^2 is quadratic (after "Instant Colorization of Gaussian Splats",
-2026). Renderers clamp colours at zero; the equations do not, and leave that to the descent that follows.
+With frozen geometry a pixel is a fixed weighted sum of colours, and a colour is a fixed weighted sum of SH
+coefficients. So sum_v |W_v B_v x - image_v|^2 + ridge |x - prior|^2 is quadratic in the coefficients x (after "Instant
+Colorization of Gaussian Splats", 2026). Renderers clamp colours at zero. The equations do not; the descent that follows
+does.
+
+Targets are corrected for errors of the views between rounds, and the ridge of the higher bands is chosen by
+cross-validation over views.
 """
 
 from collections.abc import Sequence
@@ -16,17 +20,16 @@ from splatgraft.consolidation.frozen_views import Views
 from splatgraft.consolidation.view_errors import CorrectedTargets
 from splatgraft.runtime.progress import Progress, silent
 
-_ROUNDS, _STEPS = 3, 6
-"""Times that targets are corrected and the equations solved, each from the last solution; and steps of conjugate
-gradient per round, which blend every view once and apply the transpose once."""
+_ROUNDS = 3  # corrections of the targets, each with a solution that starts from the last one
+_STEPS = 6  # steps of conjugate gradient per round; each blends every view and applies the transpose once
 _PRIOR_PX = 0.1  # ridge towards the composite's colour, pixels: it decides only Gaussians that no view sees
 _BAND_RIDGES = (0.003, 0.02, 0.1)
-"""Ridges of the higher bands to choose from, as shares of the pixels that the Gaussian makes up. Which one predicts
-held-out views best depends on how much the views disagree. Below ten views: the largest."""
+"""Ridges of the higher bands to choose from, as shares of the pixels that the Gaussian makes up. The best
+one for held-out views depends on the disagreement of the views. Below ten views the largest is taken."""
 _FACTORED_AT_ONCE = 2**14  # gaussians per batch of Cholesky factorisations, which bounds the memory
 _SUMMED_AT_ONCE = 2**12  # gaussians per batch of a dot product
-_COMPARED_VIEWS = 40  # views at most on which ridges are compared
-_HOLD_OUT_EVERY = 5  # every how many views one is left out while ridges are compared
+_COMPARED_VIEWS = 40  # largest number of views on which ridges are compared
+_HOLD_OUT_EVERY = 5  # one view in five is left out in the comparison of ridges
 
 
 @dataclass(frozen=True)
@@ -45,11 +48,11 @@ class _Equations:
     """Weight of the prior, pixels."""
 
     def with_ridge(self, band_ridge: float) -> "_Equations":
-        """The same with another ridge for the higher bands."""
+        """Replace the ridge of the higher bands."""
         return replace(self, ridge=_ridge(self.seen, self.ridge.shape[1], band_ridge))
 
     def apply(self, sh: Float[Tensor, "m k 3"]) -> Float[Tensor, "m k 3"]:
-        """The matrix times coefficients."""
+        """Multiply the matrix by coefficients."""
         out = self.ridge[..., None] * sh
         for index in self.which:
             view = self.views[index]
@@ -62,11 +65,11 @@ class _Equations:
 def solve(
     prior: Float[Tensor, "m k 3"], targets: CorrectedTargets, *, progress: Progress = silent
 ) -> Float[Tensor, "m k 3"]:
-    """The colours with the least squared error over all views, with a ridge towards `prior`; targets are refined."""
+    """Find the colours of least squared error over all views, with a ridge towards `prior`; refines the targets."""
     trials = len(_BAND_RIDGES) if len(targets.views) >= 2 * _HOLD_OUT_EVERY else 0
     total = _ROUNDS + trials + 1
     progress(0, total, "setting up the equations")
-    # the strongest ridge first: colours that hardly depend on the view cannot fit a view's own error as a highlight
+    # the strongest ridge first: then colours hardly depend on the view, and cannot fit a view's error as a highlight
     equations = _build_equations(prior, targets.views, max(_BAND_RIDGES))
     sh, error = prior, 0.0
     for turn in range(_ROUNDS):
@@ -82,9 +85,9 @@ def solve(
 
 
 def _select_ridge(prior: Float[Tensor, "m k 3"], targets: CorrectedTargets, equations: _Equations) -> float:
-    """The ridge whose short solution without every 5th view predicts those views best (cross-validation).
+    """Choose the ridge whose short solution without every 5th view predicts those views best (cross-validation).
 
-    Of many views some are enough, evenly spaced: the ridge is one number, and a share of the pixels that are seen.
+    If there are many views, evenly spaced ones are enough, because the ridge is one number.
     """
     count = len(targets.views)
     compared = min(count, _COMPARED_VIEWS)
@@ -102,7 +105,7 @@ def _select_ridge(prior: Float[Tensor, "m k 3"], targets: CorrectedTargets, equa
 
 
 def _build_equations(prior: Float[Tensor, "m k 3"], views: Views, band_ridge: float) -> _Equations:
-    """Blocks sum_v (W^T W 1) b b^T: W is non-negative, so these row sums bound what neighbours add to a Gaussian."""
+    """Build the blocks sum_v (W^T W 1) b b^T; W is non-negative, so that these row sums bound the neighbours' part."""
     m, k = prior.shape[:2]
     blocks, seen = prior.new_zeros(m, k, k), prior.new_zeros(m, 1)
     for index in range(len(views)):
@@ -126,7 +129,7 @@ def _ridge(seen: Float[Tensor, "m 1"], k: int, band_ridge: float) -> Float[Tenso
 def _residual(
     sh: Float[Tensor, "m k 3"], targets: CorrectedTargets, which: Sequence[int], *, refine: bool
 ) -> tuple[Float[Tensor, "m k 3"], float]:
-    """Right-hand side left over at `sh`, and the root mean square error over the views' pixels."""
+    """Compute the residual of the equations' right-hand side at `sh`, and the RMSE over the views' pixels."""
     views, out, squares, count = targets.views, torch.zeros_like(sh), 0.0, 0
     for index in which:
         view = views[index]
@@ -151,7 +154,7 @@ def _difference(targets: CorrectedTargets, index: int, picture: Float[Tensor, "h
 
 
 def _conjugate_gradient(residual: Float[Tensor, "m k 3"], equations: _Equations) -> Float[Tensor, "m k 3"]:
-    """Steps on the correction, each colour channel by itself; the products are summed in double precision."""
+    """Solve for the correction, each colour channel by itself; the products are summed in double precision."""
     solution = torch.zeros_like(residual)
     conditioned = torch.bmm(equations.inverse, residual)
     direction, before = conditioned, _dot(residual, conditioned)
@@ -168,7 +171,7 @@ def _conjugate_gradient(residual: Float[Tensor, "m k 3"], equations: _Equations)
 
 
 def _dot(a: Float[Tensor, "m k 3"], b: Float[Tensor, "m k 3"]) -> Float[Tensor, "3"]:
-    # in parts, which stay in the processor's cache
+    # in parts that stay in the processor's cache
     parts = zip(a.split(_SUMMED_AT_ONCE), b.split(_SUMMED_AT_ONCE), strict=True)
     total = sum((x.double() * y.double()).sum((0, 1)) for x, y in parts)
     return torch.as_tensor(total).to(a)

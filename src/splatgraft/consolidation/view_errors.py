@@ -1,8 +1,8 @@
 """Per-view errors of a harmoniser, a low-frequency tint and a small flow, and target images without them.
 
-A harmoniser that works view by view shifts edges by a pixel and drifts in colour. Both are smooth over the image, so a
-coarse grid per view describes them; removing them from the view's image before the colours are fitted keeps the scene
-sharp. Each call takes one robust Gauss-Newton step in closed form.
+A harmoniser that works view by view shifts edges by a pixel and drifts in colour. Both errors are smooth over the
+image, so that a coarse grid per view describes them. The scene stays sharp if they are removed from the view's image
+before the colours are fitted. Each refinement takes one robust Gauss-Newton step in closed form.
 """
 
 from dataclasses import dataclass, replace
@@ -15,14 +15,12 @@ from torch import Tensor
 from splatgraft.consolidation.frozen_views import Views, memory_bytes
 
 # set by hand
-_FLOW_CELL_PX, _TINT_CELL_PX = 32.0, 88.0
-"""Distance between the knots of the flow and of the tint."""
-_FLOW_SIGMA_PX = 0.5  # expected size of the flow: the ridge that keeps it small where the image has no texture
+_FLOW_CELL_PX, _TINT_CELL_PX = 32.0, 88.0  # distance between the knots of the flow and of the tint
+_FLOW_SIGMA_PX = 0.5  # expected size of the flow: a ridge keeps it small where the image has no texture
 _MAX_FLOW_PX = 4.0 * _FLOW_SIGMA_PX
 _TINT_SIGMA = 0.1  # expected size of the logarithm of the gain
 _RESIDUAL_SIGMA = 0.05  # expected size of the remaining residual; larger ones count less (Geman-McClure weights)
-_CORRELATED_PX = 16.0
-"""Pixels over which a residual (a misplaced edge, a wrong shade) stays alike and counts as one observation."""
+_CORRELATED_PX = 16.0  # neighbouring pixels with correlated residuals, which count as one observation
 
 
 @dataclass(frozen=True)
@@ -35,13 +33,13 @@ class ViewError:
     """Natural logarithm of the factor on each channel at each knot."""
 
     def correct(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-        """The image with this error removed."""
+        """Remove this error from the image."""
         h, w = image.shape[:2]
         return _warp(image, _upsample(self.flow, h, w)) * _upsample(self.log_gain, h, w).exp()
 
 
 def no_view_error(image: Float[Tensor, "h w 3"]) -> ViewError:
-    """A zero error, on the grids for an image of that size."""
+    """Make a zero error, on the grids for an image of this size."""
     (a, b), (c, d) = ([_knots(n, cell) for n in image.shape[:2]] for cell in (_FLOW_CELL_PX, _TINT_CELL_PX))
     return ViewError(flow=image.new_zeros(a, b, 2), log_gain=image.new_zeros(c, d, 3))
 
@@ -53,7 +51,7 @@ def refine(
     render: Float[Tensor, "h w 3"],
     weight: Float[Tensor, "h w"] | None,
 ) -> ViewError:
-    """The view's error after one Gauss-Newton step on the tint, then one on the flow; images are sRGB."""
+    """Take one Gauss-Newton step on the tint of the view's error, then one on its flow; images are sRGB."""
     h, w = image.shape[:2]
     confidence = image.new_ones(h, w) if weight is None else weight
     warped = _warp(image, _upsample(view_error.flow, h, w))
@@ -64,16 +62,16 @@ def refine(
 
 
 class CorrectedTargets:
-    """The views' targets, each corrected by its `ViewError` (a few kB), which is refined while colours are fitted."""
+    """Targets of the views, each corrected by its `ViewError` (a few kB), which is refined as colours are fitted."""
 
     def __init__(self, views: Views, estimated: bool = True) -> None:
-        """Start without errors; unless `estimated` none are sought."""
+        """Start with zero errors; they stay zero unless `estimated`."""
         self.views, self._estimated = views, estimated
         self._of_view: list[ViewError | None] = [None] * len(views)
         self._kept: dict[int, Tensor] | None = None
 
     def target(self, index: int) -> Float[Tensor, "h w 3"]:
-        """The view's image, corrected by its error as estimated so far."""
+        """Return the view's image, corrected by the current estimate of its error."""
         if self._kept is not None and index in self._kept:
             return self._kept[index]
         image, view_error = self.views.target(index), self._of_view[index]
@@ -83,7 +81,7 @@ class CorrectedTargets:
         return corrected
 
     def keep(self) -> None:
-        """From now on keep corrected images in what the views leave of their cache; errors are not refined any more."""
+        """Fix the errors, and keep corrected images in the unused part of the views' cache."""
         self._kept = {}
 
     def refine(self, index: int, render: Float[Tensor, "h w 3"]) -> None:
@@ -96,7 +94,7 @@ class CorrectedTargets:
         self._of_view[index] = refine(known, image, render.detach(), self.views.weight(index))
 
     def center(self) -> None:
-        """Subtract the mean gain of all views from their errors, since it belongs to the scene."""
+        """Subtract the mean gain of all views from their errors, because it belongs to the scene."""
         gains = [n.log_gain.mean((0, 1)) for n in self._of_view if n is not None]
         if gains:
             mean = torch.stack(gains).mean(0)
@@ -131,7 +129,7 @@ def _refine_flow(
     confidence: Float[Tensor, "h w"],
 ) -> Float[Tensor, "a b 2"]:
     rows, columns = _grid_bases(flow, tinted)
-    # a slight blur widens the basin of the linearisation to about 1.5 px and keeps noise out of the slopes
+    # a slight blur widens the range of the linearisation to about 1.5 px and keeps noise out of the slopes
     smooth_image, smooth_render = _blur(tinted), _blur(render)
     residual = smooth_render - smooth_image
     robust = _robust_weights(residual, confidence)
@@ -148,20 +146,20 @@ def _refine_flow(
 
 
 def _robust_weights(residual: Float[Tensor, "h w 3"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Confidence times Geman-McClure weights of the residual."""
+    """Multiply the confidence by Geman-McClure weights of the residual."""
     squares = _over_channels(residual**2) / (3 * _RESIDUAL_SIGMA**2)
     return confidence / (1 + squares) ** 2
 
 
 def _observations_per_knot(robust: Float[Tensor, "h w"], pixels: int, knots: int) -> float:
-    """Independent observations per knot: weighted pixels over `_CORRELATED_PX`, as neighbours are correlated."""
+    """Estimate the independent observations per knot: weighted pixels over the number of correlated ones."""
     return max(float(robust.sum()) / pixels, 1e-3) * pixels / knots / _CORRELATED_PX
 
 
 def _normal_matrix(
     weights: Float[Tensor, "h w"], rows: Float[Tensor, "h a"], columns: Float[Tensor, "w b"]
 ) -> Float[Tensor, "ab ab"]:
-    """sum_p weights_p phi_p phi_p^T for phi = rows x columns, by the separability of the grid."""
+    """Compute sum_p weights_p phi_p phi_p^T for phi = rows x columns, by the separability of the grid."""
     a, b = rows.shape[1], columns.shape[1]
     across = weights @ (columns[:, :, None] * columns[:, None, :]).reshape(-1, b * b)
     down = (rows[:, :, None] * rows[:, None, :]).reshape(-1, a * a).T @ across
@@ -169,7 +167,7 @@ def _normal_matrix(
 
 
 def _solve(normal: Float[Tensor, "k k"], right: Float[Tensor, "k"]) -> Float[Tensor, "k"]:
-    """The solution of symmetric, positive definite equations."""
+    """Solve symmetric, positive definite equations."""
     return torch.cholesky_solve(right[:, None], torch.linalg.cholesky(normal))[:, 0]
 
 
@@ -185,7 +183,7 @@ def _grid_bases(
 
 
 def _linear_weights(length: int, knots: int, *, like: Tensor) -> Float[Tensor, "length knots"]:
-    """Linear interpolation weights from evenly spaced knots, the outer ones at the image's ends, to pixel centres."""
+    """Compute linear weights of evenly spaced knots, the outer ones at the image's ends, at pixel centres."""
     position = (torch.arange(length, dtype=like.dtype, device=like.device) + 0.5) / length * (knots - 1)
     return (1 - (position[:, None] - torch.arange(knots, device=like.device)).abs()).clamp_min(0)
 
@@ -196,7 +194,7 @@ def _upsample(grid: Float[Tensor, "a b c"], height: int, width: int) -> Float[Te
 
 
 def _warp(image: Float[Tensor, "h w 3"], flow: Float[Tensor, "h w 2"]) -> Float[Tensor, "h w 3"]:
-    """The image at p + flow, bicubic so that sub-pixel shifts do not blur; the border repeats."""
+    """Sample the image at p + flow, bicubic so that sub-pixel shifts do not blur; the border repeats."""
     if not flow.any():
         return image
     h, w = image.shape[:2]
@@ -209,7 +207,7 @@ def _warp(image: Float[Tensor, "h w 3"], flow: Float[Tensor, "h w 2"]) -> Float[
 
 
 def _blur(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Binomial taps 1 4 6 4 1 along both axes; the border repeats."""
+    """Blur by binomial taps 1 4 6 4 1 along both axes; the border repeats."""
     for axis in (0, 1):
         length = image.shape[axis]
         first, last = image.narrow(axis, 0, 1), image.narrow(axis, length - 1, 1)
@@ -220,7 +218,7 @@ def _blur(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
 
 
 def _over_channels(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-    # torch sums a last axis of three numbers several times as slowly
+    # torch's sum over a last axis of three numbers is several times slower
     red, green, blue = image.unbind(-1)
     return red + green + blue
 

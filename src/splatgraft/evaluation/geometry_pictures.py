@@ -1,4 +1,4 @@
-"""Pictures of a scene's surface from its depth map: inverse depth in colours, and the directions that surfaces face.
+"""Pictures of a scene's surface from a depth map: inverse depth in colours, and normals in colours.
 
 Normals are central differences of the pixels' points in the camera frame, after a median filter of inverse depth.
 """
@@ -25,9 +25,9 @@ _FAR_TO_NEAR = torch.tensor(
         [0.993, 0.906, 0.144],
     ]
 )  # sRGB; every 32nd colour of viridis (van der Walt and Smith, CC0), whose lightness rises evenly
-_FAR_QUANTILE, _NEAR_QUANTILE = 0.02, 0.98  # of inverse depth; few pixels beyond them get the end colours
-_MEDIAN_PX = 5  # window; neighbouring pixels see the planes of different Gaussians, whose depths differ a little
-_STEP = 0.05  # of the inverse depth; a surface that bends by more from pixel to pixel is two; set by hand
+_FAR_QUANTILE, _NEAR_QUANTILE = 0.02, 0.98  # of inverse depth; pixels beyond them get the end colours
+_MEDIAN_PX = 5  # window; neighbouring pixels see planes of different Gaussians, whose depths differ a little
+_STEP = 0.05  # share of the inverse depth; a surface that bends by more between pixels counts as two; set by hand
 _OPENGL_FROM_OPENCV = torch.tensor([1.0, -1.0, -1.0])  # y and z of the camera frame change their signs
 
 
@@ -43,7 +43,7 @@ def depth_colors(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
     solid = depth > 0
     if not bool(solid.any()):
         return depth.new_zeros(*depth.shape, 3)
-    inverse = _inverse(depth)
+    inverse = inverse_depth(depth)
     far, near = np.quantile(inverse[solid].cpu().numpy(), (_FAR_QUANTILE, _NEAR_QUANTILE)).tolist()
     share = ((inverse - far) / max(near - far, np.finfo(np.float32).tiny)).clamp(0, 1)
     table = _FAR_TO_NEAR.to(depth)
@@ -65,17 +65,30 @@ def normals_from_depth(depth: Float[Tensor, "h w"], camera: Cameras) -> Float[Te
         0 where a pixel or one of its four neighbours has no surface, or where there is a depth step between them.
         The outermost pixels repeat the values beside them.
     """
-    inverse = torch.where(depth > 0, _median(_inverse(depth)), 0.0)
-    rays = camera.to("cpu").rays()
-    points = rays * _inverse(inverse)[..., None]
+    inverse = torch.where(depth > 0, _median(inverse_depth(depth)), 0.0)
+    normals = normals_by_differences(inverse, camera.to("cpu")) * _OPENGL_FROM_OPENCV
+    normals = torch.where(_one_surface(inverse)[..., None], normals, 0.0)
+    padded = F.pad(normals.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0].permute(1, 2, 0)
+    return torch.where((inverse > 0)[..., None], padded, 0.0)
+
+
+def normals_by_differences(inverse: Float[Tensor, "h w"], camera: Cameras) -> Float[Tensor, "h-2 w-2 3"]:
+    """Compute unit normals towards the camera, OpenCV axes, by central differences of the points of inner pixels.
+
+    `inverse` is inverse depth along the optical axis; normals beside a pixel of 0, without a surface, are undefined.
+    """
+    rays = camera.rays()
+    points = rays * inverse_depth(inverse)[..., None]
     along_u = points[1:-1, 2:] - points[1:-1, :-2]
     along_v = points[2:, 1:-1] - points[:-2, 1:-1]
     normals = F.normalize(torch.linalg.cross(along_u, along_v), dim=-1)
     away = (normals * rays[1:-1, 1:-1]).sum(-1, keepdim=True) > 0
-    normals = torch.where(away, -normals, normals) * _OPENGL_FROM_OPENCV
-    normals = torch.where(_one_surface(inverse)[..., None], normals, 0.0)
-    padded = F.pad(normals.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="replicate")[0].permute(1, 2, 0)
-    return torch.where((inverse > 0)[..., None], padded, 0.0)
+    return torch.where(away, -normals, normals)
+
+
+def inverse_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Invert a depth map, or an inverse one; 0, which means no surface, stays 0."""
+    return torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1), 0)
 
 
 def normal_colors(normals: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
@@ -96,7 +109,3 @@ def _one_surface(inverse: Float[Tensor, "h w"]) -> Bool[Tensor, "h-2 w-2"]:
 def _median(inverse: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Take the median of each pixel's window, which keeps planes and edges."""
     return torch.from_numpy(cv2.medianBlur(inverse.contiguous().numpy(), _MEDIAN_PX))
-
-
-def _inverse(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    return torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1), 0)

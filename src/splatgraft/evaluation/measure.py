@@ -18,13 +18,11 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.runtime.lazy_sequence import LazySequence
 
 SHADOW_RATIO = 0.95
-"""Linear light with the object over linear light without it, below which a pixel counts as shadowed."""
+"""Ratio of linear light with the object to linear light without it, below which a pixel counts as shadowed."""
 
-
-_CHANGED = 2 / 255
-"""sRGB difference with and without the object from which a pixel counts as changed; set by hand, as the next three."""
-_RATIO_OFFSET = 0.002
-"""Linear light added to both sides of a ratio: 6/255 in sRGB, below which 8 bits do not resolve a shadow."""
+# set by hand
+_CHANGED = 2 / 255  # sRGB difference with and without the object above which a pixel counts as changed
+_RATIO_OFFSET = 0.002  # linear light added to both sides of a ratio: 6/255 in sRGB; below, 8 bits resolve no shadow
 _OBJECT_MARGIN_PX = 2  # pixels around the object that belong to no region
 _REST_MARGIN = 0.01  # margin between changed pixels and the rest, as a share of the image's width; at least 2 pixels
 
@@ -36,21 +34,21 @@ class Truth:
     image: Float[Tensor, "h w 3"]
     """The target scene with the object in it, sRGB in [0, 1]."""
     background: Float[Tensor, "h w 3"]
-    """The same view without the object, sRGB in [0, 1]."""
+    """The target scene without the object, in the same view, sRGB in [0, 1]."""
     mask: Float[Tensor, "h w"]
     """Coverage by the object, in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class Regions:
-    """Disjoint regions of a view. Pixels in none of them (penumbra, bounce, edges) count only in the whole image."""
+    """Disjoint regions of a view; other pixels (penumbra, bounced light, edges) count only in the whole image."""
 
     object: Bool[Tensor, "h w"]
-    """More than half covered by the object."""
+    """Pixels that the object covers by more than half."""
     shadow: Bool[Tensor, "h w"]
-    """Outside the object, with linear luminance (3x3 mean) below `SHADOW_RATIO` of that without the object."""
+    """Pixels off the object whose linear luminance (3x3 mean) is below `SHADOW_RATIO` of that without the object."""
     rest: Bool[Tensor, "h w"]
-    """Away from all pixels that the object changes in the ground truth."""
+    """Pixels at a distance from all pixels that the object changes in the ground truth."""
 
 
 def find_regions(truth: Truth) -> Regions:
@@ -65,7 +63,7 @@ def find_regions(truth: Truth) -> Regions:
 
 
 def luminance_ratio(image: Float[Tensor, "h w 3"], background: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
-    """Ratio of linear Rec. 709 luminance, `image` over `background`, each averaged over 3x3 pixels against noise."""
+    """Compute the ratio of linear Rec. 709 luminance, `image` over `background`, each averaged over 3x3 pixels."""
     numerator, denominator = (_mean_3x3(linear_from_srgb(x) @ LUMINANCE.to(x)) for x in (image, background))
     return (numerator + _RATIO_OFFSET) / (denominator + _RATIO_OFFSET)
 
@@ -80,12 +78,12 @@ def _dilated(region: Bool[Tensor, "h w"], pixels: int) -> Bool[Tensor, "h w"]:
 
 
 Perceptual = Callable[[Tensor, Tensor], Tensor]
-"""A distance between two sRGB images (h, w, 3), such as LPIPS."""
+"""Distance between two sRGB images (h, w, 3), such as LPIPS."""
 
 SMALLEST_REGION = 25
-"""Pixels; smaller regions of a view are left out of the means. Set by hand."""
+"""Number of pixels below which a region of a view is left out of the means; set by hand."""
 _SHOWN = ("copy_paste", "result")  # the pictures of a view that are measured
-_SSIM_BORDER = 5  # pixels: SSIM's window reaches over the image border there
+_SSIM_BORDER = 5  # pixels in which SSIM's window reaches over the image border
 
 
 @dataclass(frozen=True)
@@ -114,10 +112,18 @@ def compare(
     background: Float[Tensor, "h w 3"],
     perceptual: Perceptual | None = None,
 ) -> dict[str, float]:
-    """All metrics of one image; nan where a region of the view has fewer than `SMALLEST_REGION` pixels.
+    """Compute all metrics of one image.
 
-    `background` is a render of the scene without the object: reconstruction errors that it shares with `image` cancel
-    in `shadow_ratio_rmse` and `rest_*_change`. `perceptual` adds "lpips".
+    Args:
+        image: The image, sRGB in [0, 1].
+        truth: Ground truth of the view.
+        regions: Regions of the view.
+        background: A render of the scene without the object, sRGB in [0, 1]. Reconstruction errors that it shares with
+            `image` cancel in `shadow_ratio_rmse` and `rest_*_change`.
+        perceptual: A distance that becomes the metric "lpips".
+
+    Returns:
+        The metrics by name; nan if a region of the view has fewer than `SMALLEST_REGION` pixels.
     """
     similarity = ssim_map(image, truth.image).mean(-1)
     inner = (slice(_SSIM_BORDER, -_SSIM_BORDER), slice(_SSIM_BORDER, -_SSIM_BORDER))
@@ -143,11 +149,11 @@ def compare(
 
 
 def measure(views: Sequence[ComparedView], perceptual: Perceptual | None = None) -> dict:
-    """The content of metrics.json; missing values are None.
+    """Compute the content of metrics.json; missing values are None.
 
-    `copy_paste` and `result`: means over held-out views, or over all where none is held out (`views` names which).
-    `all_views`: the same over every view. `per_view`: every value. `rest_max_change` is a maximum over views; the
-    other metrics are means over the views where they are defined.
+    `copy_paste` and `result` have the means over held-out views, or over all views if no view is held out (`views`
+    names which). `all_views` has the means over every view, `per_view` every value. `rest_max_change` is a maximum over
+    views; the other metrics are means over the views in which they are defined.
     """
     rows = [_row(view, perceptual) for view in views]
     held_out = [row for row in rows if row["held_out"]]
@@ -169,7 +175,7 @@ def _row(view: ComparedView, perceptual: Perceptual | None) -> dict:
 
 
 def _compared(image: Tensor, truth: Truth, background: Tensor, perceptual: Perceptual | None) -> dict[str, float]:
-    """`compare` of what may be outside of [0, 1], in the view's own regions."""
+    """Compute the metrics of an image that may exceed [0, 1], in the view's own regions."""
     image, background = image.clamp(0, 1), background.clamp(0, 1)
     return compare(image, truth, regions=find_regions(truth), background=background, perceptual=perceptual)
 
@@ -179,7 +185,7 @@ def _means(rows: Sequence[dict]) -> dict[str, dict[str, float | None]]:
 
 
 def _mean_of(rows: Sequence[dict[str, float]]) -> dict[str, float | None]:
-    """The mean of each metric over the views where it is defined; None where it is defined in none."""
+    """Compute the mean of each metric over the views in which it is defined; None if there is no such view."""
     means: dict[str, float | None] = {}
     for name in rows[0] if rows else ():
         values = [row[name] for row in rows if math.isfinite(row[name])]
@@ -205,15 +211,15 @@ def evaluate(
     Args:
         images: v pictures (h, w, 3) of the result, sRGB in [0, 1].
         truth: The ground truth of each view, as `true_views` gives it.
-        backgrounds: A render of the target scene without the object for each view, sRGB in [0, 1]: the error of the
+        backgrounds: A render of the target scene without the object for each view, sRGB in [0, 1]. The error of the
             reconstruction itself then cancels in `shadow_ratio_rmse` and `rest_*_change`.
-        perceptual: A distance between two (h, w, 3) images such as LPIPS; without it there is no "lpips".
+        perceptual: A distance between two (h, w, 3) images such as LPIPS, which becomes the metric "lpips".
 
     Returns:
         `psnr` (dB), `ssim` and `flip` of the whole image and of the regions object, shadow and rest;
         `shadow_ratio_rmse`, the error of the shadow as a ratio of linear luminance; `rest_max_change` and
         `rest_mean_change` (sRGB). Each is the mean over the views in which its region has at least 25 pixels (the
-        maximum for `rest_max_change`), and None where no view has.
+        maximum for `rest_max_change`), and None if there is no such view.
 
     Raises:
         ValueError: There is not one truth and one background per picture.
@@ -226,14 +232,14 @@ def evaluate(
 
 
 def true_views(truth: PosedImages, target: PosedImages) -> LazySequence[Truth]:
-    """The ground truth of every view: the images with the object, the target's images of the same name, the masks.
+    """Pair the ground truth's images and masks with the target's images of the same name.
 
     Args:
-        truth: A capture of the target with the object really in it, with a mask of the object for every view.
+        truth: A capture of the target with the real object in it, and a mask of the object for every view.
         target: The capture of the target without the object.
 
     Returns:
-        One `Truth` per view of `truth`, read when asked for.
+        One `Truth` per view of `truth`, read on access.
 
     Raises:
         ValueError: A view of the truth has no mask, or no image of the same name in the target.

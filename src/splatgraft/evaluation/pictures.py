@@ -1,4 +1,4 @@
-"""Pictures for reports: labelled images side by side, animations, and how the transfer changed the light of a view."""
+"""Pictures for reports: labelled images side by side, animations, and maps of the change of light in a view."""
 
 import io
 import math
@@ -37,7 +37,7 @@ def write_animation(
     pictures = [_pil(frame) for frame in frames]
     data = encode(pictures, fps)
     while len(data) > max_bytes and pictures[0].width > 16:
-        # the size in bytes is about proportional to the area; 0.95 leaves a margin, so that one or two rounds suffice
+        # the size in bytes is about proportional to the area; with a margin of 0.95 one or two rounds suffice
         factor = 0.95 * math.sqrt(max_bytes / len(data))
         size = (max(16, int(pictures[0].width * factor)), max(1, int(pictures[0].height * factor)))
         pictures = [picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures]
@@ -69,7 +69,7 @@ def _labelled(image: Float[Tensor, "h w 3"], label: str) -> Float[Tensor, "h w 3
 
 
 def _gif(pictures: Sequence[Image.Image], fps: float) -> bytes:
-    # one palette for all frames, from several of them: no flicker, and a smaller file
+    # one palette for all frames, made from several: no flicker, and a smaller file
     samples = pictures[:: max(1, len(pictures) // 8)]
     sheet = Image.new("RGB", (samples[0].width, samples[0].height * len(samples)))
     for i, picture in enumerate(samples):
@@ -93,10 +93,9 @@ def _animated(frames: Sequence[Image.Image], kind: str, *, duration: int, **sett
 _DARKER = torch.tensor([0.16, 0.32, 0.78])
 _BRIGHTER = torch.tensor([0.93, 0.55, 0.10])
 _UNCHANGED = torch.tensor([0.93, 0.93, 0.93])
-_NOISE_STOPS = 0.02  # photographic stops; smaller changes stay grey in the change map. The noise between two renders.
+_NOISE_STOPS = 0.02  # photographic stops: the noise between two renders; smaller changes stay grey in the change map
 _FULL_COLOR_STOPS = 1.0  # photographic stops at which the change map has its full colours; set by hand
-_EXPONENT = 0.7
-"""Exponent of the colours of the change map; below 1, so that faint shadows stay visible beside strong ones."""
+_EXPONENT = 0.7  # exponent of the change map's colours; below 1, faint shadows stay visible beside strong ones
 
 
 def describe_change(
@@ -104,8 +103,9 @@ def describe_change(
 ) -> dict[str, float]:
     """Describe how the luminance of `result` differs from copy-paste, given the coverage by the object.
 
-    object_brightness: mean ratio of linear luminance on the object, 1 where the view shows no object.
-    darkened_fraction, brightened_fraction: shares of the pixels outside it that lost or gained more than 5% of it.
+    object_brightness: mean ratio of linear luminance on the object; 1 if the view shows no object.
+    darkened_fraction, brightened_fraction: shares of the pixels off the object that lost or gained more than 5% of
+    their luminance.
     """
     ratio = luminance_ratio(result, composite)
     inside, outside = mask > 0.5, mask <= 0

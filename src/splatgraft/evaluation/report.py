@@ -88,7 +88,7 @@ class ReportView:
     held_out: bool
     """Whether no step before the evaluation used a picture of this view."""
     pictures: Mapping[str, Float[Tensor, "h w 3"]]
-    """Label to sRGB image, e.g. "Copy-paste", "Result"; the slider first shows the first two."""
+    """sRGB images by label, such as "Copy-paste" and "Result"; the slider begins with the first two."""
 
 
 @dataclass(frozen=True)
@@ -100,19 +100,19 @@ class StepTime:
     seconds: float
     """Wall-clock time."""
     note: str = ""
-    """A short remark, such as "41k Gaussians, 27.4 dB held out"."""
+    """Short remark, such as "41k Gaussians, 27.4 dB held out"."""
 
 
 @dataclass(frozen=True)
 class ReportWarning:
-    """Something that may be wrong with the result."""
+    """A warning that a step gave about the result."""
 
     step: str
-    """Name of the step that said it, such as "compose"."""
+    """Name of the step, such as "compose"."""
     note: Note
-    """What may be wrong, and what helps."""
+    """Text of the warning, and a remedy."""
     picture: Float[Tensor, "h w 3"] | None = None
-    """An sRGB image that shows it."""
+    """sRGB image that shows the problem."""
 
 
 @dataclass(frozen=True)
@@ -120,21 +120,21 @@ class Report:
     """The texts and metrics of the page."""
 
     title: str
-    """One line."""
+    """Title of the page, one line."""
     subtitle: str
     """One sentence on object and target."""
     warnings: tuple[ReportWarning, ...] = ()
-    """What may be wrong, in the order of the steps; it stands at the top."""
+    """Warnings of the steps, in their order, for the top of the page."""
     metrics: dict | None = None
-    """The content of metrics.json, see `measure`; None without ground truth."""
+    """Content of metrics.json, see `measure`; None without ground truth."""
     changes: Mapping[str, float] = field(default_factory=dict)
     """`describe_change` averaged over views, shown without ground truth."""
     not_measured: Mapping[str, str] = field(default_factory=dict)
-    """Missing metric to the reason, e.g. {"lpips": "no weights at ..."}."""
+    """Reason for each missing metric, such as {"lpips": "no weights at ..."}."""
     light: str = ""
     """Description of the light transfer; each line becomes a paragraph."""
     steps: tuple[StepTime, ...] = ()
-    """In the order of execution."""
+    """Duration of the steps, in the order of execution."""
     machine: str = ""
     """The machine on which the times were measured."""
     limits: tuple[str, ...] = ()
@@ -149,12 +149,12 @@ def write_report(
     geometry: Iterable[ReportView] = (),
     turntable: Sequence[Float[Tensor, "h w 3"]] = (),
 ) -> Path:
-    """Write index.html with its pictures, one view at a time, and metrics.json where there are metrics.
+    """Write index.html with its pictures, one view at a time, and metrics.json if there are metrics.
 
     Args:
-        folder: Where to write.
+        folder: Folder of the report; it is created.
         report: Texts and metrics.
-        views: Those that the page compares; it begins with the first.
+        views: The views that the page compares; it begins with the first.
         geometry: Result, depth and normals of some views, shown side by side.
         turntable: Frames around the object.
 

@@ -1,4 +1,4 @@
-"""A page that works offline: style and scripts around HTML sections, and the viewer that compares pictures of views.
+"""An HTML page that works offline, and in it a viewer that compares pictures of views.
 
 Style and scripts are in page.css and page.js.
 """
@@ -12,22 +12,22 @@ from importlib.resources import files
 
 @dataclass(frozen=True)
 class ViewFiles:
-    """The picture files of one view, relative to the page."""
+    """The picture files of one view, with paths relative to the page."""
 
     name: str
     """The view's name."""
     held_out: bool
     """Whether no step before the evaluation used a picture of this view."""
     files: Mapping[str, str]
-    """Label to file."""
+    """File of each picture, by its label."""
     width: int
-    """Pixels."""
+    """Width of the pictures, pixels."""
     height: int
-    """Pixels."""
+    """Height of the pictures, pixels."""
 
 
 def html_page(title: str, subtitle: str, sections: str, *, views: Sequence[ViewFiles]) -> str:
-    """Format a page with style and scripts around HTML `sections`; `views` are those that its `viewer` shows."""
+    """Format a page with style and scripts around HTML `sections`; its `viewer` shows `views`."""
     here = files("splatgraft.evaluation")
     data = json.dumps([{**asdict(view), "files": dict(view.files)} for view in views]).replace("<", "\\u003c")
     return f"""<!doctype html>

@@ -10,22 +10,21 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.directions import tangents
 
-_FULL_CIRCLE_GAP_DEG = 75.0
-"""With a wider angle than this without captured cameras, the path is an arc back and forth; set by hand."""
-_SMOOTHING_DEG = 20.0
-"""Standard deviation, in angle, of the weights by which captured distances and heights are averaged; set by hand."""
+# set by hand
+_FULL_CIRCLE_GAP_DEG = 75.0  # widest gap between captured azimuths for a full circle; beyond it the path is an arc
+_SMOOTHING_DEG = 20.0  # standard deviation of the weights, in azimuth, that average captured distances and heights
 
 
 @dataclass(frozen=True)
 class TurntableOptions:
-    """Options of the camera path; numbers set by hand."""
+    """Options of the camera path; the defaults are set by hand."""
 
     frames: int = 60
-    """Frames in one loop."""
+    """Number of frames in one loop."""
     zoom: float = 1.25
     """Focal length over the median of the captured cameras."""
     start: Float[Tensor, "3"] | None = None
-    """Direction from the centre of the first frame's camera, as near as the path comes to it; None: any."""
+    """Direction from the centre towards the first frame's camera, met as nearly as the path allows; None: any."""
 
 
 def turntable_cameras(
@@ -37,8 +36,9 @@ def turntable_cameras(
 ) -> Cameras:
     """Make a closed path of cameras around `center` that look at it.
 
-    Distance and height at an azimuth are means of the captured ones, weighted by nearness in azimuth, so that the path
-    stays between captured viewpoints. Pictures have the size of the first captured one.
+    Distance and height at an azimuth are means over the captured cameras, weighted by nearness in azimuth, so that the
+    path stays between captured viewpoints. The path is a full circle, or an arc back and forth if the captured azimuths
+    leave a gap of more than 75 degrees. Pictures have the size of the first captured one.
     """
     up = torch.nn.functional.normalize(up.double(), dim=0)
     across, along = tangents(up)
@@ -51,7 +51,7 @@ def turntable_cameras(
         turned = torch.cos(path - torch.atan2(start @ along, start @ across))
         path = path.roll(-int(turned.argmax()))
     difference = torch.remainder(path[:, None] - azimuth[None] + math.pi, 2 * math.pi) - math.pi
-    # softmax of log weights: no underflow far from all cameras, where the nearest one decides
+    # softmax of log weights does not underflow far from all cameras
     weights = torch.softmax(-0.5 * (difference / math.radians(_SMOOTHING_DEG)) ** 2, dim=1)
     ring, level = weights @ distance, weights @ height
     eyes = center.double() + (ring * path.cos())[:, None] * across + (ring * path.sin())[:, None] * along
@@ -71,5 +71,5 @@ def _loop_of_angles(azimuth: Float[Tensor, "v"], frames: int) -> Float[Tensor, "
         return ordered[0] + 2 * math.pi * phase
     start = ordered[(widest + 1) % len(ordered)]
     arc = 2 * math.pi - float(gaps[widest])
-    # a cosine, so that the motion slows down at both ends
+    # by a cosine the motion slows down at both ends
     return start + arc * (1 - (2 * math.pi * phase).cos()) / 2

@@ -1,1 +1,1 @@
-"""Scenes, pictures and pages for other programs and other people."""
+"""Exports: files of a scene for other programs, pictures, videos, and HTML pages."""

@@ -1,4 +1,4 @@
-"""Writes a scene, a part of one, or pictures of it, in the format that the suffix of a file names."""
+"""Writes a scene, one of its layers, or pictures of it; the file's suffix chooses the format."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,47 +24,47 @@ _PART_BACKGROUND = 0.8  # grey on which a page shows an object or a shadow alone
 
 _PICTURES, _TURNTABLES = (".png", ".jpg"), (".mp4", ".gif", ".webp")
 EXPORT_SUFFIXES = (".html", *WRITTEN_SCENE_SUFFIXES, *_PICTURES, *_TURNTABLES)
-"""Suffixes of the formats."""
+"""Suffixes of the files that can be written."""
 
 Layer = Literal["all", "object", "scene", "shadow", "object-with-shadow"]
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What is written, and how."""
+    """Layer, frame and precision of an export."""
 
     layer: Layer = "all"
     """all: the whole scene; object: the relit object alone; scene: the place without object and shadow; shadow: black
-    Gaussians that darken what lies behind them as the shadow does; object-with-shadow: both, for a compositor."""
+    Gaussians that darken a picture behind them as the shadow does; object-with-shadow: both, for a compositor."""
     frame: Literal["auto", "capture", "world"] = "auto"
     """Frame of a scene. capture: as in the project; world: upright and in metres, as far as they are known; auto: world
     for .glb, which asks for it, else capture."""
     spz_version: int = 4
     """Version of a .spz: 4, or 3 for programs that do not read 4 yet."""
     sh_degree: int = 3
-    """Highest SH degree that is written, 0 to 3: files of lower ones are smaller, and highlights move less."""
+    """Highest SH degree that is written, 0 to 3; with a lower one files are smaller and highlights move less."""
     width: int | None = None
-    """Width of pictures and videos, pixels; 1280 where not given, and for a turntable at most the captured images'."""
+    """Width of pictures and videos, pixels; 1280 by default, for a turntable no more than the captured images have."""
     frames: int = 120
-    """Number of pictures of a turntable; 24 are a second."""
+    """Number of pictures of a turntable, 24 per second."""
 
 
 def export_scene(
     source: ExportSource, to: Path, options: ExportOptions = ExportOptions(), *, progress: Progress = silent
 ) -> tuple[str, ...]:
-    """Write a file; it appears whole or not at all.
+    """Write a file atomically.
 
     Args:
-        source: What is written.
+        source: The scene, with its parts and cameras if they are known.
         to: A file whose suffix is among `EXPORT_SUFFIXES`.
-        options: Which part, and how.
-        progress: Told of the steps of a shadow's fit and of the pictures of a turntable.
+        options: Layer, frame and precision.
+        progress: Called in the steps of a shadow's fit and for the pictures of a turntable.
 
     Returns:
-        Sentences for the user: what was assumed, left out or turned.
+        Sentences for the user, on assumptions, Gaussians left out and the frame.
 
     Raises:
-        ValueError: The suffix is another, an option is out of range, or the source has not what is asked for.
+        ValueError: The suffix is unknown, an option is out of range, or the source lacks the requested layer.
     """
     suffix = scene_suffix(to)
     if suffix not in EXPORT_SUFFIXES:
@@ -110,7 +110,7 @@ def _write_scene(to: Path, gaussians: Gaussians, source: ExportSource, options: 
 
 
 def layer_of(source: ExportSource, layer: Layer, *, progress: Progress = silent) -> tuple[Gaussians, tuple[str, ...]]:
-    """One layer without Gaussians that are not finite, and sentences on it; ValueError where layers are not known."""
+    """Make one layer, without Gaussians that are not finite, and sentences on it; ValueError if layers are unknown."""
     if layer == "all":
         return _finite(source.scene)
     if source.is_object is None or source.place is None:
@@ -127,8 +127,8 @@ def layer_of(source: ExportSource, layer: Layer, *, progress: Progress = silent)
         said = "the object casts no shadow that the target's cameras see"
     else:
         said = (
-            f"the shadow is black over what lies behind, of {shadow.gaussians.count:,} Gaussians; over the empty place "
-            f"it is {shadow.psnr:.1f} dB from the scene, in views that it was not fitted to"
+            f"the shadow has {shadow.gaussians.count:,} black Gaussians that darken the picture behind them; over the "
+            f"empty place it gives the scene's shadow with {shadow.psnr:.1f} dB PSNR in views outside its fit"
         )
     parts = [shadow.gaussians] if layer == "shadow" else [object_, shadow.gaussians]
     chosen, left_out = _finite(concatenate(parts))
@@ -136,7 +136,7 @@ def layer_of(source: ExportSource, layer: Layer, *, progress: Progress = silent)
 
 
 def _limited(gaussians: Gaussians, options: ExportOptions) -> Gaussians:
-    """Without bands above the wanted degree."""
+    """Drop SH bands above the requested degree."""
     return gaussians.with_sh_degree(min(options.sh_degree, gaussians.sh_degree))
 
 

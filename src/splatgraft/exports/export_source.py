@@ -1,4 +1,4 @@
-"""The value `ExportSource`, a scene to export and what is known of it; its frame, first view and a path around it."""
+"""The value `ExportSource`, a scene to export with its parts and cameras; its frame, first view, and a camera path."""
 
 import math
 from dataclasses import dataclass, field
@@ -21,53 +21,53 @@ _DOWN_Y = (0.0, -1.0, 0.0)
 """Up in the axes of a .ply, whose y points down; formats whose y points up turn it on writing."""
 _FOV_DEG = 45.0
 _ASPECT = 4 / 3
-_DISTANCE = 2.2  # from the middle of a scene without cameras, in its radii
+_DISTANCE = 2.2  # distance of the first view from the middle of a scene without cameras, in radii
 _ELEVATION_DEG = 20.0
-_IN_FRONT = 0.5  # cosine of the angle between a camera that may be the first one and the side that was photographed
-_CENTRAL = 0.6  # half of the picture's sides within which the object's middle lies in a view that may be the first one
+_IN_FRONT = 0.5  # smallest cosine of the angle between the first view's direction and the photographed side
+_CENTRAL = 0.6  # largest distance of the object's middle from the first view's centre, over half of the sides
 
 Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class ExportSource:
-    """A scene, and where it is the result of a transfer, what it was made from; all in one frame."""
+    """A scene and, if it is the result of a transfer, the scenes before it; all in one frame."""
 
     scene: Gaussians
-    """The scene; of a transfer the relit one, n Gaussians."""
+    """The scene, n Gaussians; the relit composite after a transfer."""
     title: str
-    """What pages call it."""
+    """Title of pages."""
     is_object: Bool[Tensor, "n"] | None = None
-    """Which Gaussians of `scene` belong to an object; None where it is not known."""
+    """Whether each Gaussian of `scene` belongs to an object; None if unknown."""
     pasted: Gaussians | None = None
-    """The same scene before the light transfer."""
+    """The composite before the light transfer."""
     place: Gaussians | None = None
-    """The target without object and shadow."""
+    """The target scene without object and shadow."""
     cameras: Cameras | None = None
-    """Those of the capture that the scene was made from."""
+    """Cameras of the capture from which the scene was made."""
     photographed_side: Float[Tensor, "3"] | None = None
-    """Horizontal direction from the object to the side that its photographs show; None where they show all."""
+    """Horizontal direction from the object to the side that its photographs show; None if they show all sides."""
     metadata: SceneMetadata = field(default_factory=SceneMetadata)
-    """Up direction and size of a world unit, where they are known."""
+    """Up direction and size of a world unit, if they are known."""
 
 
 @dataclass(frozen=True)
 class FirstView:
-    """Where the viewer's camera starts, and what it turns around; world units."""
+    """First camera of a viewer and the point around which it turns; world units."""
 
     eye: Point
     """Position of the camera."""
     center: Point
-    """The point in the middle of the picture."""
+    """Point in the middle of the picture, around which the camera turns."""
     up: Point
-    """Unit vector."""
+    """Unit up direction."""
     fov_deg: float
-    """Vertical field of view of a picture `aspect` wide, degrees."""
+    """Vertical field of view, degrees."""
     aspect: float
-    """Width over height."""
+    """Width of the picture over its height."""
 
     def camera(self, width: int) -> Cameras:
-        """The same view as a camera of pictures `width` pixels wide."""
+        """Make the camera of this view for pictures `width` pixels wide."""
         height = max(2, round(width / self.aspect))
         focal = height / 2 / math.tan(math.radians(self.fov_deg) / 2)
         eye, center, up = (torch.tensor(point) for point in (self.eye, self.center, self.up))
@@ -75,11 +75,11 @@ class FirstView:
 
 
 def first_view(source: ExportSource) -> tuple[FirstView, tuple[str, ...]]:
-    """The view, and sentences on what was assumed.
+    """Choose the first view; gives sentences on assumptions, too.
 
-    With cameras: from the one that is nearest to the object's middle among those that have it near the middle of their
-    picture, on the side that was photographed where that is one. Without: from a little above, towards the middle of
-    the dense part.
+    With cameras it is the captured view nearest to the object's middle. It must show the middle centrally, from the
+    side that was photographed if there is only one. Without cameras the view is from a little above, towards the middle
+    of the dense part.
     """
     center = middle_of(source)
     up, said = up_of(source)
@@ -96,22 +96,24 @@ def first_view(source: ExportSource) -> tuple[FirstView, tuple[str, ...]]:
 
 
 def middle_of(source: ExportSource) -> Float[Tensor, "3"]:
-    """The median of the object's centres, else what the cameras look at, else the middle of the dense part."""
+    """Compute the median of the object's centres, else the cameras' focus point, else the middle of the dense part."""
     if source.is_object is not None and bool(source.is_object.any()):
         return source.scene.means[source.is_object].median(0).values
     if source.cameras is not None:
         try:
             return focus_point(source.cameras)
-        except ValueError:  # cameras that look outwards
+        except ValueError:  # the cameras look outwards
             return source.scene.means.median(0).values
     return bounding_sphere(source.scene).center
 
 
 def up_of(source: ExportSource) -> tuple[Float[Tensor, "3"], tuple[str, ...]]:
-    """The up direction, and a sentence where it is not known."""
+    """Return the up direction, and a sentence if it is not known."""
     if source.metadata.up is not None:
         return torch.nn.functional.normalize(torch.tensor(source.metadata.up), dim=0), ()
-    return torch.tensor(_DOWN_Y), ("up is not known and taken to be -y, as of a level camera; --cameras says it",)
+    return torch.tensor(_DOWN_Y), (
+        "the up direction is not known and taken to be -y, as of a level camera; give it by --cameras",
+    )
 
 
 def _nearest(source: ExportSource, center: Float[Tensor, "3"]) -> int:
@@ -134,10 +136,10 @@ def _point(values: Float[Tensor, "3"]) -> Point:
 
 
 def path_around(source: ExportSource, view: FirstView, *, frames: int, width: int) -> Cameras:
-    """Cameras on a closed path around the view's centre.
+    """Make cameras on a closed path around the view's centre.
 
-    Between the captured viewpoints where there are cameras, else on a circle through the first view. Sides are even
-    numbers of pixels, as video needs them.
+    The path lies between the captured viewpoints, or without cameras on a circle through the first view. The sides of
+    the pictures are even numbers of pixels, because video requires that.
     """
     if frames < 2:
         raise ValueError(f"--frames: expected 2 or more, found {frames}")
@@ -160,16 +162,17 @@ def path_around(source: ExportSource, view: FirstView, *, frames: int, width: in
 
 
 def upright(source: ExportSource) -> tuple[Similarity, SceneMetadata, tuple[str, ...]]:
-    """The transform to a frame whose y is vertical and whose unit is a metre, what is known of it, and what to say.
+    """Compute the transform to a frame whose y axis is vertical and whose unit is a metre.
 
-    The origin stays, and the scene turns as little as it can.
+    The origin stays, and the scene turns as little as possible. Gives the metadata in that frame and sentences on
+    assumptions, too.
     """
     up, said = up_of(source)
     metres = source.metadata.metres_per_unit
     rotation = rotation_between(up, torch.tensor(_DOWN_Y))
     moved = Similarity(scale=metres or 1.0, rotation=rotation, translation=torch.zeros(3))
     size = (
-        "its size is not known: a unit of the capture is written as a metre; `splatgraft scale` says how large it is"
+        "its size is not known: a unit of the capture is written as a metre; `splatgraft scale` sets the size"
         if metres is None
         else f"one unit is a metre; one of the capture was {metres:.4g} m"
     )

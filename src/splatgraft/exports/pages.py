@@ -1,8 +1,8 @@
-"""HTML files that load nothing from anywhere: scenes with a viewer for them, and the report of `evaluate`.
+"""HTML files without any request to the network: scenes with a viewer, and the report of `evaluate`.
 
 The scenes are SOG, the viewer is `viewer/viewer.js` on the PlayCanvas engine (MIT; its licence is part of the page).
-Until the engine has drawn, a still of the opening view is shown. A content security policy in the page forbids every
-request. Pictures of a report are made smaller and put into the page.
+The page shows a still of the opening view until the engine has drawn. A content security policy in the page forbids
+every request. Pictures of a report are made smaller and put into the page.
 """
 
 import base64
@@ -39,29 +39,29 @@ _THUMBNAIL_PX = 240  # twice the width at which the page shows them
 _DATA = re.compile(r'(<script type="application/json" id="views">)(.*?)(</script>)', re.DOTALL)
 _LOCAL = re.compile(r'(<(?:img|a)\b[^>]*?\b(?:src|href)=")([^":#]+)(")')
 _NOTE = "The page needs only the files in its folder; it loads nothing from the network."
-_SPLIT = 0.5  # where the divider between two scenes stands at first, share of the width
+_SPLIT = 0.5  # first position of the divider between two scenes, share of the width
 _WIDEST = 2.0
-"""A page narrower than the first view shows the same width, up to this factor of the tangent of its vertical field of
-view."""
+"""Largest factor on the tangent of half the vertical field of view: a page narrower than the first view widens it to
+show the view's whole width."""
 _STILL_ASPECT = 1.2
-"""Width over height of the still, whose height is that of the narrowest page: it covers pages of up to 2.4."""
-_STILL_PX = 1600  # width of the still: 1280 pixels of a page 1.6 wide are 1067 of it
+"""Width over height of the still; with the height of the narrowest page it covers pages of an aspect up to 2.4."""
+_STILL_PX = 1600  # width of the still; a page of 1280 x 800 pixels shows 1067 of them
 _STILL_QUALITY = 60
 _NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="
-"""An empty picture, until the page's script sets the pictures of a view."""
+"""Empty picture, shown until the page's script sets the pictures of a view."""
 
 
 def write_viewer_page(
     path: Path, scenes: Mapping[str, Gaussians], view: FirstView, *, title: str, background: float = 0.0
 ) -> None:
-    """Write a page of one finite scene, or of two by their labels, which a divider compares: the first is left of it.
+    """Write a page that shows one scene, or two with a divider between them; the first is left of it.
 
-    `background` is the grey behind the scene, sRGB.
+    `scenes` has finite Gaussians by label. `background` is the grey behind the scene, sRGB.
     """
     here = files("splatgraft.exports") / "viewer"
     engine = (here / "playcanvas.js").read_bytes()
     distance = sum((a - b) ** 2 for a, b in zip(view.eye, view.center, strict=True)) ** 0.5
-    told = {
+    viewer_options = {
         "scenes": list(scenes),
         "split": _SPLIT if len(scenes) > 1 else 0,
         "eye": view.eye,
@@ -90,7 +90,7 @@ def write_viewer_page(
         split=round(100 * _SPLIT),
         hidden="" if len(scenes) > 1 else " hidden",
         still_tallest=f"{100 * _WIDEST:g}%",
-        view=json.dumps(told).replace("<", "\\u003c"),
+        view=json.dumps(viewer_options).replace("<", "\\u003c"),
         engine=_base64(gzip.compress(engine, 9, mtime=0)),
         data=data,
         reset=_icon("M4 4v6h6 M5 10a8 8 0 1 1-.6 5"),
@@ -103,7 +103,7 @@ def write_viewer_page(
 
 
 def _still(scenes: list[Gaussians], view: FirstView, background: float) -> bytes:
-    """The opening view as WebP, with margins for pages of other shapes; two scenes side by side of the divider."""
+    """Draw the opening view as WebP, with margins for pages of other shapes; two scenes share it at the divider."""
     tangent = _WIDEST * math.tan(math.radians(view.fov_deg) / 2)
     wider = replace(view, fov_deg=2 * math.degrees(math.atan(tangent)), aspect=_STILL_ASPECT)
     camera = wider.camera(_STILL_PX)
@@ -121,7 +121,7 @@ def _still(scenes: list[Gaussians], view: FirstView, background: float) -> bytes
 
 
 def write_report_file(path: Path, report: Path) -> None:
-    """Write the index.html that `evaluate` wrote beside its pictures as one file; ValueError where one is missing."""
+    """Write the report of `evaluate`, an index.html with its pictures, as one file; ValueError if one is missing."""
     if not report.is_file():
         raise ValueError(f"{report}: expected the report of a project, found none; `splatgraft run` writes it")
     text = report.read_text(encoding="utf-8")
@@ -142,8 +142,8 @@ def write_report_file(path: Path, report: Path) -> None:
     def local(found: re.Match[str]) -> str:
         tag, name = found[1], found[2]
         if 'id="left"' in tag or 'id="right"' in tag:
-            return tag + _NOTHING + found[3]  # set by the page's script, which has the same picture
-        if name.endswith(".json"):  # browsers do not open data addresses, but they save them
+            return tag + _NOTHING + found[3]  # the page's script, which has the same picture, sets it
+        if name.endswith(".json"):  # browsers save data addresses, but do not open them
             tag = tag.replace("<a ", f'<a download="{name}" ')
         small = name.startswith("views/")
         return tag + (_embedded(folder / name, _THUMBNAIL_PX) if small else whole(name)) + found[3]
@@ -155,7 +155,7 @@ def write_report_file(path: Path, report: Path) -> None:
 
 
 def _embedded(path: Path, longest_px: int) -> str:
-    """A file as a data address; pictures no larger than `longest_px`, animations and other files as they are."""
+    """Encode a file as a data address; pictures are reduced to `longest_px`, animations and JSON are kept."""
     if not path.is_file():
         raise ValueError(f"{path}: expected a file of the report, found none; `splatgraft run` writes it again")
     if path.suffix.lower() == ".json":

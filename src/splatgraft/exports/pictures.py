@@ -23,12 +23,12 @@ from splatgraft.runtime.files import atomic_write, writable
 from splatgraft.runtime.progress import Progress, silent
 
 FPS = 24
-_LEAST_BYTES = 1 << 12  # no video is smaller; a disk with less room is full
-_QUALITY = "19"  # constant rate factor of x264: no loss is seen
+_LEAST_BYTES = 1 << 12  # smaller than any video; a disk with less room is full
+_QUALITY = "19"  # constant rate factor of x264, visually lossless
 
 
 def write_picture(path: Path, gaussians: Gaussians, view: FirstView, *, width: int, with_alpha: bool) -> None:
-    """Write the first view as .png or .jpg; a .png `with_alpha` has straight colours, others black behind the scene."""
+    """Write the first view as .png or .jpg; `with_alpha` gives a .png with straight alpha, else black lies behind."""
     drawn = render(gaussians, view.camera(width))
     color = drawn.color[0].clamp(0, 1)
     if not with_alpha:
@@ -42,13 +42,13 @@ def write_picture(path: Path, gaussians: Gaussians, view: FirstView, *, width: i
 
 
 def write_turntable(path: Path, gaussians: Gaussians, cameras: Cameras, *, progress: Progress = silent) -> str:
-    """Write what the cameras of a path see as .mp4, .gif or .webp; gives a sentence on it."""
+    """Write the views of a path of cameras as .mp4, .gif or .webp; gives a sentence on the result."""
     frames = len(cameras)
     if path.suffix.lower() == ".mp4":
         codec = write_video(path, _drawn(gaussians, cameras, progress))
         return f"{frames / FPS:.1f} s of {cameras.width} x {cameras.height} in {codec}"
     write_animation(path, list(_drawn(gaussians, cameras, progress)), fps=float(FPS))
-    return f"{frames / FPS:.1f} s, scaled down where it would be larger than 6 MB"
+    return f"{frames / FPS:.1f} s, scaled down if it would be larger than 6 MB"
 
 
 def _drawn(gaussians: Gaussians, cameras: Cameras, progress: Progress) -> Iterator[Float[Tensor, "h w 3"]]:
@@ -61,8 +61,8 @@ def _drawn(gaussians: Gaussians, cameras: Cameras, progress: Progress) -> Iterat
 def write_video(path: Path, frames: Iterable[Float[Tensor, "h w 3"]]) -> str:
     """Write sRGB pictures of one size as .mp4; gives the name of the codec.
 
-    H.264 where PyAV is installed, which every player knows; else VP9 by OpenCV, which browsers know. The file appears
-    whole or not at all.
+    With PyAV it is H.264, which every player reads; without, it is VP9 by OpenCV, which browsers read. The file is
+    written atomically.
     """
     if not path.parent.is_dir():
         raise ValueError(f"{path}: expected an existing folder to write into, found no {path.parent}")
@@ -98,7 +98,7 @@ def _by_opencv(path: Path, partial: Path, frames: Iterable[Float[Tensor, "h w 3"
     import cv2
 
     writer, written, count = None, None, 0
-    # a frame is encoded while the next one is made
+    # a frame is encoded while the next one is rendered
     with ThreadPoolExecutor(1) as pool:
         for frame in frames:
             pixels, count = _bytes(frame), count + 1
@@ -119,7 +119,7 @@ def _by_opencv(path: Path, partial: Path, frames: Iterable[Float[Tensor, "h w 3"
 
 
 def _check_video(path: Path, partial: Path, frames: int) -> None:
-    """Read the number of frames back: OpenCV says nothing of what it cannot write."""
+    """Check the number of frames in the file: OpenCV does not report frames that it cannot write."""
     import cv2
 
     written = cv2.VideoCapture(str(partial))

@@ -1,10 +1,12 @@
 """The shadow of a transfer as black Gaussians, to be drawn over another picture of the place.
 
-Over-compositing black with opacity a multiplies what lies behind by 1 - a. The Gaussians of the place on which the
-shadow falls are therefore coloured black, and their opacities fitted so that the pictures of the target's cameras get
-as dark as the shadow makes them (least squares, Adam). Light that the object adds to the place is left out.
+Over-compositing black with opacity a multiplies the picture behind it by 1 - a. So the Gaussians of the place on which
+the shadow falls are coloured black, and their opacities are fitted to the shadow in the target's cameras (least
+squares, Adam). Light that the object adds to the place is left out.
 """
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,13 +20,13 @@ from splatgraft.exports.export_source import ExportSource
 from splatgraft.rendering import render, view_operator
 from splatgraft.runtime.progress import Progress, silent
 
-_VIEWS = 24
-"""Cameras of the target; every fourth one is left out of the fit and measured. All numbers are set by hand, on the
-demo's scenes."""
+# set by hand, on the demo's scenes
+_VIEWS = 24  # cameras of the target; every fourth one is left out of the fit and measured
 _LONGEST_PX = 320  # longer side of the pictures
 _STEPS = 240  # steps of Adam, one view each
+_STRIDE = 7  # smallest distance, in views, between two steps
 _LEARNING_RATE = 0.15  # step size for opacity logits; it falls to a tenth
-_MIN_GROUND = 0.02  # sRGB below which nothing is said about the share of light that is missing
+_MIN_GROUND = 0.02  # sRGB below which the share of missing light counts as 0
 _MIN_SHARE = 0.01  # share of light that a Gaussian must miss to be part of the layer
 _MIN_WEIGHT_PX = 0.5  # pixels that a Gaussian must make up in all views together
 _MIN_OPACITY = 1 / 255  # opacity below which a Gaussian is left out at the end
@@ -32,17 +34,17 @@ _MIN_OPACITY = 1 / 255  # opacity below which a Gaussian is left out at the end
 
 @dataclass(frozen=True)
 class ShadowLayer:
-    """Black Gaussians, and how well they do."""
+    """Black Gaussians and the quality of their fit."""
 
     gaussians: Gaussians
-    """In the frame of the scene; none where there is no shadow."""
+    """Black Gaussians in the frame of the scene; empty without a shadow."""
     psnr: float | None
-    """The place with the layer over it against the scene with the shadow, in views outside the fit, dB."""
+    """PSNR of the place under the layer against the scene with the shadow, in views outside the fit, dB."""
 
 
 @dataclass(frozen=True)
 class _View:
-    """What the layer is fitted to."""
+    """Pictures of one view to which the layer is fitted."""
 
     camera: Cameras
     place: Float[Tensor, "h w 3"]
@@ -51,7 +53,11 @@ class _View:
 
 
 def shadow_layer(source: ExportSource, *, progress: Progress = silent) -> ShadowLayer:
-    """Fit the layer to the relit scene without its object, against the place; ValueError where these are not known."""
+    """Fit the layer to the relit scene without its object, against the place.
+
+    Raises:
+        ValueError: The scene's object, the place or the cameras are not known.
+    """
     if source.is_object is None or source.place is None or source.cameras is None:
         raise ValueError(
             f"--layer shadow: expected a project with its target's scene and cameras, found {source.title} without"
@@ -69,7 +75,7 @@ def shadow_layer(source: ExportSource, *, progress: Progress = silent) -> Shadow
 
 
 def _view(camera: Cameras, ground: Gaussians, place: Gaussians) -> _View:
-    """A view and the share of light, in sRGB, that the shadow takes."""
+    """Draw a view and compute the share of light, in sRGB, that the shadow takes."""
     shadowed, before = (render(scene, camera).color[0].clamp(0, 1) for scene in (ground, place))
     level = before.mean(-1)
     darkness = (1 - shadowed.mean(-1) / level.clamp_min(_MIN_GROUND)).clamp(0, 1)
@@ -77,7 +83,7 @@ def _view(camera: Cameras, ground: Gaussians, place: Gaussians) -> _View:
 
 
 def _receivers(ground: Gaussians, views: list[_View]) -> Gaussians:
-    """The Gaussians on which the shadow falls, black, with the share of light that each misses as opacity."""
+    """Find the Gaussians on which the shadow falls; each is black, its opacity the share of light that it misses."""
     missing, seen = torch.zeros(ground.count), torch.zeros(ground.count)
     for view in views:
         operator = view_operator(ground, view.camera)
@@ -95,10 +101,10 @@ def _fitted(layer: Gaussians, views: list[_View], progress: Progress) -> Gaussia
     logits = layer.opacity_logits.clone().requires_grad_()
     optimizer = torch.optim.Adam([logits], lr=_LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / _STEPS))
-    for step in range(_STEPS):
-        view = views[step * 7 % len(views)]
+    for step, index in enumerate(_view_order(len(views))):
+        view = views[index]
         alpha = render(replace(layer, opacity_logits=logits), view.camera).alpha[0]
-        # weighted by what lies behind, as that is what the layer changes
+        # weighted by the picture behind, because the layer multiplies it
         loss = ((alpha - view.darkness) * view.place.mean(-1)).square().mean()
         optimizer.zero_grad()
         loss.backward()
@@ -107,6 +113,12 @@ def _fitted(layer: Gaussians, views: list[_View], progress: Progress) -> Gaussia
         progress(step + 1, _STEPS, "fitting the shadow")
     done = replace(layer, opacity_logits=logits.detach())
     return done.select(done.opacities > _MIN_OPACITY)
+
+
+def _view_order(count: int) -> Iterator[int]:
+    """Visit all views in turn, in steps of the smallest stride that has no common factor with their number."""
+    stride = next(n for n in range(_STRIDE, _STRIDE + count + 1) if math.gcd(n, count) == 1)
+    return (step * stride % count for step in range(_STEPS))
 
 
 def _psnr(layer: Gaussians, views: list[_View]) -> float:

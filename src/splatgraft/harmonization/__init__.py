@@ -1,13 +1,7 @@
-"""Harmonization of rendered views: an image model corrects the light on an inserted object, one view at a time."""
+"""Harmonisation of rendered views: an image model corrects the light on an inserted object, one view at a time."""
 
 from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize, render_views
-from splatgraft.harmonization.interface import (
-    Harmonized,
-    Harmonizer,
-    HarmonizerContext,
-    HarmonizerInputs,
-    NoisyStartHarmonizer,
-)
+from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
 from splatgraft.harmonization.methods import (
     HARMONIZERS,
     CompactOptions,
@@ -29,7 +23,6 @@ __all__ = [
     "HarmonizerContext",
     "HarmonizerInputs",
     "HarmonizerOptions",
-    "NoisyStartHarmonizer",
     "NoneOptions",
     "harmonize",
     "make_harmonizer",

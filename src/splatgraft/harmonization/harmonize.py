@@ -1,4 +1,4 @@
-"""Harmonisation of all views of a composite with one method, and the renders that it takes."""
+"""Renders the views of a composite, and harmonises them one by one with one method."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,18 +27,18 @@ def render_views(
     prior_confidence: float = 0.0,
     options: RenderOptions = RenderOptions(),
 ) -> LazySequence[HarmonizerInputs]:
-    """Render what a harmoniser takes of every view of a composite.
+    """Render the images that a harmoniser takes, for every view of a composite.
 
     Args:
         composite: n Gaussians, the object as it was captured: the first result of `Composite.bake`.
-        is_object: Which of them belong to an object: its second result.
+        is_object: Whether each of them belongs to an object: the second result of `Composite.bake`.
         cameras: v cameras of the target; sizes may differ.
-        prior: The scene after light transfer, as `Relit.bake` gives it; the composite itself where not given.
-        prior_confidence: How reliable the light behind `prior` is, in [0, 1] (`Relit.confidence`).
-        options: How the scenes are drawn.
+        prior: The scene after light transfer, as `Relit.bake` gives it; the composite itself by default.
+        prior_confidence: Reliability of the light behind `prior`, in [0, 1] (`Relit.confidence`).
+        options: Options of the renderer.
 
     Returns:
-        The pictures of each camera, on the CPU. A view is rendered each time it is read, so that memory holds one.
+        The images of each camera, on the CPU. A view is rendered each time it is read, so that memory holds one view.
 
     Raises:
         ValueError: `is_object` has another length than `composite`.
@@ -76,7 +76,7 @@ class HarmonizedViews:
     images: tuple[Float[Tensor, "_ _ 3"], ...]
     """One (h, w, 3) sRGB image in [0, 1] per view."""
     confidence: tuple[Float[Tensor, "_ _"], ...] | None
-    """One (h, w) confidence in [0, 1] per view, the `weights` of `consolidate`; None where the method gives none."""
+    """One (h, w) confidence in [0, 1] per view, the `weights` of `consolidate`; None if the method gives none."""
 
     def __len__(self) -> int:
         return len(self.images)
@@ -85,7 +85,7 @@ class HarmonizedViews:
 def harmonize(
     views: Sequence[HarmonizerInputs], method: str | Harmonizer = "compact", *, progress: Progress = silent
 ) -> HarmonizedViews:
-    """Make the light of every view agree, each view by itself.
+    """Correct the light on the object in every view, each view by itself.
 
     Args:
         views: v views, as `render_views` gives them; each is read once.
@@ -94,7 +94,7 @@ def harmonize(
         progress: Called after every view with views done, v, and the number of the view.
 
     Returns:
-        The images and, where the method estimates it, their confidence.
+        The images and, if the method estimates it, their confidence.
 
     Raises:
         ValueError: There is no method of that name, or its weights or packages are missing.

@@ -1,12 +1,12 @@
-"""Harmonising with an open image-editing model: any pipeline of diffusers that takes an image and a prompt.
+"""Harmonisation with an open image-editing model: any pipeline of diffusers that takes an image and a prompt.
 
-The paper compares with such a model behind a service (Sec. 7, Nano Banana); its prompt is used here as it stands there.
+The paper compares with such a model behind a service (Sec. 7, Nano Banana); its prompt is the default here.
 """
 
 import inspect
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,9 +20,6 @@ from splatgraft.harmonization.flux.loading import diffusers_library
 from splatgraft.harmonization.flux.tensor_file import one_line
 from splatgraft.harmonization.interface import Harmonized, HarmonizerContext, HarmonizerInputs
 
-if TYPE_CHECKING:
-    from splatgraft.harmonization.methods import EditOptions
-
 PROMPT = (
     "I copy-pasted an object from one photograph to the other. I will give you the photograph and the mask of the "
     "copied object, white is the object and black is the background. Edit the photograph such that the copied object "
@@ -32,17 +29,29 @@ PROMPT = (
 )
 """The paper's prompt, verbatim."""
 _REACH, _FEATHER = 1.0, 0.5
-"""Width of the object's neighbourhood, and of the band in which it fades out, over the root of the object's area."""
+"""Width of the neighbourhood that may change, and of the band in which it fades out, over the root of the area."""
 _SEVERAL = ("Flux2", "QwenImageEditPlus")
-"""Begins of the names of pipelines that take a list of pictures, here composite and mask."""
+"""First letters of the names of pipelines that take several pictures: here composite and mask."""
 
 
-def load_editor(options: "EditOptions", context: HarmonizerContext) -> "ImageEditor":
-    """Load a pipeline from a folder or the hub: bfloat16 on CUDA with one part on the card at a time, else float32.
+def load_editor(
+    model: str, context: HarmonizerContext, *, prompt: str | None, seed: int, sampling_steps: int | None
+) -> "ImageEditor":
+    """Load a pipeline from a folder or the hub.
 
-    Raises: ValueError where there is no such pipeline, or it does not take an image and a prompt.
+    On CUDA it runs in bfloat16 with one part on the card at a time, on the CPU in float32.
+
+    Args:
+        model: Folder or hub id.
+        context: Device, and where messages go.
+        prompt: Instruction to the model; None takes the paper's.
+        seed: Seed of the noise.
+        sampling_steps: Number of sampling steps; None takes the pipeline's own.
+
+    Raises:
+        ValueError: There is no such pipeline, or it does not take an image and a prompt.
     """
-    model, on_cuda = str(options.model), context.device.type == "cuda"
+    on_cuda = context.device.type == "cuda"
     if not Path(model).exists():
         context.say(f"weights: {model} of the Hugging Face hub; its licence: https://huggingface.co/{model}")
     try:
@@ -62,33 +71,33 @@ def load_editor(options: "EditOptions", context: HarmonizerContext) -> "ImageEdi
         pipeline.enable_model_cpu_offload(device=context.device)
     takes_mask = name.startswith(_SEVERAL)
     context.say(f"edit: {name} of {model}, given " + ("composite and mask" if takes_mask else "the composite alone"))
-    settings: dict[str, Any] = {"prompt": options.prompt or PROMPT}
-    if options.sampling_steps is not None:
-        settings["num_inference_steps"] = options.sampling_steps
-    return ImageEditor(pipeline, takes_mask, frozenset(known), settings, options.seed)
+    settings: dict[str, Any] = {"prompt": prompt or PROMPT}
+    if sampling_steps is not None:
+        settings["num_inference_steps"] = sampling_steps
+    return ImageEditor(pipeline, takes_mask, frozenset(known), settings, seed)
 
 
 @dataclass(frozen=True)
 class ImageEditor:
-    """An image-editing pipeline as a harmoniser; all views begin at the same noise."""
+    """An image-editing pipeline as a harmoniser; all views begin with the same noise."""
 
     pipeline: Any
     takes_mask: bool
     """Whether the mask is given as a second picture."""
     parameters: frozenset[str]
-    """Of the pipeline's call."""
+    """Names of the parameters that the pipeline takes."""
     settings: dict[str, Any]
-    """Of every call: prompt, steps."""
+    """Arguments of every call: prompt and number of steps."""
     seed: int
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """Edit the composite; what lies away from the object keeps the composite's colours."""
+        """Edit the composite; pixels away from the object keep the composite's colours."""
         height, width = view.mask.shape
         composite, mask = _picture(view.composite), _picture((view.mask > 0.5).float()[..., None].expand(-1, -1, 3))
         size = {"height": height, "width": width}
         made = self.pipeline(
             image=[composite, mask] if self.takes_mask else composite,
-            # on the CPU, so that the noise is the same on every device
+            # drawn on the CPU, so that the noise is the same on every device
             generator=torch.Generator().manual_seed(self.seed),
             **{name: value for name, value in size.items() if name in self.parameters},
             **self.settings,
@@ -99,7 +108,7 @@ class ImageEditor:
 
 
 def near_object(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """1 on the object and around it as far as the root of its area, where its shadow falls, then falling to 0."""
+    """Compute the share of the edit in each pixel: 1 up to the root of the area around the object, then down to 0."""
     inside = (mask.cpu() > 0.5).numpy()
     if not inside.any():
         return torch.zeros(mask.shape)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -24,11 +24,11 @@ class HarmonizerInputs:
     normal: Float[Tensor, "h w 3"]
     """Unit normal of the composite towards the camera, in the target's world; 0 where nothing is hit."""
     prior: Float[Tensor, "h w 3"]
-    """The composite after light transfer, sRGB in [0, 1]; equal to `composite` where none was done."""
+    """The composite after light transfer, sRGB in [0, 1]; equal to `composite` without a transfer."""
     prior_confidence: float = 0.0
-    """Confidence in the light estimate behind `prior`, in [0, 1]; 0 where there was no light transfer."""
+    """Confidence in the light estimate behind `prior`, in [0, 1]; 0 without a light transfer."""
     camera_from_world: Float[Tensor, "3 3"] | None = None
-    """World-to-camera rotation (OpenCV axes); None where `normal` is in the camera's frame already."""
+    """World-to-camera rotation (OpenCV axes); None if `normal` is in the camera's frame already."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Harmonized:
     image: Float[Tensor, "h w 3"]
     """The harmonised view, sRGB in [0, 1]."""
     confidence: Float[Tensor, "h w"] | None = None
-    """Confidence in each pixel, in [0, 1]; None where the harmoniser does not estimate it."""
+    """Confidence in each pixel, in [0, 1]; None if the harmoniser does not estimate it."""
 
 
 @runtime_checkable
@@ -50,35 +50,17 @@ class Harmonizer(Protocol):
         ...
 
 
-@runtime_checkable
-class NoisyStartHarmonizer(Protocol):
-    """A harmoniser that can start from a partly noisy image, which later iterative updates use (paper, ablations)."""
-
-    def harmonize_from(self, view: HarmonizerInputs, strength: float) -> Harmonized:
-        """Harmonise `view`, conditioned on its composite, starting from its prior at a noise level in (0, 1]."""
-        ...
-
-
 @dataclass(frozen=True)
 class HarmonizerContext:
-    """Where a harmoniser runs and how much it will be asked to do."""
+    """Device and workload of a harmoniser."""
 
     device: torch.device = torch.device("cpu")  # noqa: RUF009
-    """Where the network runs."""
+    """Device of the network."""
     views: int = 1
-    """How many views will be harmonised: the price of a service."""
+    """Number of views that will be harmonised; it decides the price of a service."""
     pixels: int = 704 * 496
-    """Pixels per view: the memory of a network."""
+    """Pixels per view; they decide the memory of a network."""
     strengths: tuple[float, ...] = (1.0,)
-    """Noise levels that views will be started from, in (0, 1]."""
+    """Noise levels in (0, 1] from which views will be started."""
     say: Callable[[str], None] = lambda sentence: None
-    """Takes messages for the user, one line each."""
-
-
-def noise_levels(schedule: Literal["linear", "geometric"], updates: int) -> tuple[float, ...]:
-    """Noise that each of several harmonisations starts from: from 1 to 0.1 with equal differences or equal ratios.
-
-    Paper: section Ablations, Iterative Dataset Update. The first starts from noise alone.
-    """
-    steps = [number / max(updates - 1, 1) for number in range(updates)]
-    return tuple(1 - 0.9 * step if schedule == "linear" else 0.1**step for step in steps)
+    """Function that takes messages for the user, one line each."""

@@ -1,4 +1,4 @@
-"""The harmonisation methods: the options of each, by name, which make its harmoniser."""
+"""The harmonisation methods by name: the options of each, and the harmoniser that they make."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ from splatgraft.harmonization.interface import Harmonized, Harmonizer, Harmonize
 
 @runtime_checkable
 class HarmonizerOptions(Protocol):
-    """Options of one method; heavy libraries are imported only when they make the harmoniser."""
+    """Options of one method; `make` imports its heavy libraries."""
 
     name: ClassVar[str]
     """The method's name."""
@@ -31,7 +31,7 @@ class NoneOptions:
 
 
 class _Identity:
-    """Returns the prior unchanged."""
+    """Harmoniser that returns the prior unchanged."""
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
         """Return the tensor `view.prior` itself."""
@@ -45,9 +45,9 @@ class CompactOptions:
     name: ClassVar[str] = "compact"
 
     weights: str | None = None
-    """A compact.safetensors, or the folder of a training; the shipped weights where not given."""
+    """A compact.safetensors, or the folder of a training; the shipped weights by default."""
     strength: float = 1.0
-    """How much of the correction is applied, in [0, 1]."""
+    """Share of the correction that is applied, in [0, 1]."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
         """Load the compact network."""
@@ -68,19 +68,19 @@ class FluxOptions:
     name: ClassVar[str] = "flux"
 
     weights: str | None = None
-    """Folder or hub id of the weights; `dot3d` is the authors' (nviolante/dot3d). Must be given."""
+    """Folder or hub id of the weights, which must be given; `dot3d` names the authors' (nviolante/dot3d)."""
     base: str | None = None
-    """Folder or hub id of the model that the weights were trained from, for the parts that they lack."""
+    """Folder or hub id of the model from which the weights were trained, for the parts that they lack."""
     lora: Path | None = None
     """A low-rank adaptation (lora.safetensors) to merge into the weights."""
     variant: Literal["auto", "image-mask", "image-background"] = "auto"
-    """The network's input beside the composite; auto reads it from the weights' folder."""
+    """Second input of the network, beside the composite; auto reads it from the weights' folder."""
     seed: int = 0
     """Seed of the noise, shared by all views."""
     sampling_steps: int = 4
-    """Steps of the diffusion sampling."""
+    """Number of sampling steps."""
     precision: Literal["auto", "bf16", "fp8", "offload", "float32"] = "auto"
-    """How the weights are kept: fp8 in 8 bits, offload on the CPU; auto takes the best that fits the free memory."""
+    """Storage of the weights: fp8 in 8 bits, offload on the CPU; auto takes the best that fits the free memory."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
         """Load the network."""
@@ -90,9 +90,11 @@ class FluxOptions:
                 "the paper's authors under their own licence), found none"
             )
         from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer
-        from splatgraft.harmonization.flux.loading import load_flux
+        from splatgraft.harmonization.flux.loading import FluxFiles, load_flux
 
-        return FluxHarmonizer(load_flux(self, context), seed=self.seed, steps=self.sampling_steps)
+        files = FluxFiles(self.weights, self.base, self.lora, self.variant)
+        network = load_flux(files, context, precision=self.precision, sampling_steps=self.sampling_steps)
+        return FluxHarmonizer(network, seed=self.seed, steps=self.sampling_steps)
 
 
 @dataclass(frozen=True)
@@ -102,13 +104,13 @@ class EditOptions:
     name: ClassVar[str] = "edit"
 
     model: str | None = None
-    """Folder or hub id of a diffusers pipeline that takes an image and a prompt; must be given."""
+    """Folder or hub id of a diffusers pipeline that takes an image and a prompt, which must be given."""
     prompt: str | None = None
-    """What to do; the paper's prompt (Sec. 7) where not given."""
+    """Instruction to the model; the paper's prompt (Sec. 7) by default."""
     seed: int = 0
     """Seed of the noise, shared by all views."""
     sampling_steps: int | None = None
-    """Steps of the diffusion sampling; the pipeline's own where not given."""
+    """Number of sampling steps; the pipeline's own by default."""
 
     def make(self, context: HarmonizerContext) -> Harmonizer:
         """Load the pipeline."""
@@ -119,20 +121,20 @@ class EditOptions:
             )
         from splatgraft.harmonization.image_editing import load_editor
 
-        return load_editor(self, context)
+        return load_editor(self.model, context, prompt=self.prompt, seed=self.seed, sampling_steps=self.sampling_steps)
 
 
 HARMONIZERS: dict[str, type[HarmonizerOptions]] = {
     kind.name: kind for kind in (NoneOptions, CompactOptions, FluxOptions, EditOptions)
 }
-"""Name of a method to its options."""
+"""Options of each method, by its name."""
 
 
 def make_harmonizer(method: str | HarmonizerOptions, context: HarmonizerContext = HarmonizerContext()) -> Harmonizer:
     """Make a harmoniser.
 
     Args:
-        method: Its options, or its name for the default options.
+        method: The options of a method, or its name for the default options.
         context: Device, number and size of the views, and where messages go.
 
     Raises:

@@ -26,7 +26,7 @@ def render(
     features: Float[Tensor, "n f"] | None,
     options: RenderOptions,
 ) -> Render:
-    """`rendering.render` for tensors on the CPU."""
+    """Render as `rendering.render` does, for tensors on the CPU."""
     extra = gaussians.means.new_zeros(gaussians.count, 0) if features is None else features
     fields = [t.float() for t in (*_geometry(gaussians), gaussians.sh, extra)]
     views = [_RenderView.apply(_View.of(camera, options), outputs, *fields) for camera in cameras]
@@ -35,7 +35,7 @@ def render(
 
 
 def _stack(parts: tuple[Tensor, ...]) -> Tensor:
-    # torch.stack copies even one
+    # torch.stack copies even a single tensor
     return parts[0][None] if len(parts) == 1 else torch.stack(parts)
 
 
@@ -49,7 +49,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _View:
-    """One camera and the low-pass mode in the form of the kernels' arguments."""
+    """One camera and the low-pass mode as arguments of the kernels."""
 
     numbers: np.ndarray
     width: int
@@ -73,26 +73,26 @@ class _View:
 
 @dataclass(frozen=True)
 class _TileLists:
-    """The splats of one view, nearest first, and which tiles list them."""
+    """The splats of one view, nearest first, and the tiles' lists of them."""
 
     count: int
-    """Gaussians of the scene, n."""
+    """Number n of the scene's Gaussians."""
     order: np.ndarray
-    """(m,) Gaussian of each splat."""
+    """(m,) index of each splat's Gaussian."""
     splats: np.ndarray
-    """(m, 8) in the order of `order`."""
+    """(m, 8) columns of `cpu_project`, in the order of `order`."""
     inverse_depths: np.ndarray
-    """(m, 4) in the order of `order`: `cpu_project.DEPTH_COLUMNS`; empty where they were not asked for."""
+    """(m, 4) depth columns of `cpu_project`, in the order of `order`; empty if no depth was requested."""
     start: np.ndarray
-    """(tiles + 1,) where each tile's list begins in `entries`."""
+    """(tiles + 1,) begin of each tile's list in `entries`."""
     entries: np.ndarray
-    """(e,) splats, tile after tile."""
+    """(e,) index of the splat, tile after tile."""
     slots: np.ndarray
-    """(e,) index of each entry's sums, so that those of one splat are adjacent."""
+    """(e,) row of each entry's sums; the rows of one splat are adjacent."""
     first: np.ndarray
-    """(m + 1,) where each splat's slots begin."""
+    """(m + 1,) begin of each splat's slots."""
     rows: np.ndarray
-    """(e, 2) uint8, first and one past the last row of the tile that counts; empty: as far as the splat reaches."""
+    """(e, 2) uint8, first and one past the last row of the tile that counts; empty if all rows of the splat count."""
 
     @staticmethod
     def of(view: _View, geometry: Sequence[np.ndarray], *, with_depth: bool = False) -> "_TileLists":
@@ -109,15 +109,15 @@ class _TileLists:
 
     @cached_property
     def drawn(self) -> np.ndarray:
-        """(n,) whether any tile lists the Gaussian."""
+        """(n,) whether some tile lists the Gaussian."""
         out = np.zeros(self.count, np.bool_)
         out[self.order[np.diff(self.first) > 0]] = True
         return out
 
     def without_hidden(self, view: _View, min_row_weight: float) -> "_TileLists":
-        """Lists of the splats with weight in some pixel of the tile, and the rows in which they have more than a bound.
+        """Keep only entries with rows of more weight than the bound, and of each the rows from the first to the last.
 
-        With the bound 0, rendered to the end, they give the same image.
+        With the bound 0 the lists, rendered to their ends, give the same image.
         """
         rows = np.empty((len(self.entries), 2), np.uint8)
         size = view.height, view.width
@@ -142,20 +142,20 @@ class _TileLists:
         )
 
     def in_order(self, values: np.ndarray) -> np.ndarray:
-        """The rows of `values (n, c)` that belong to the splats, (m, c)."""
+        """Gather the rows of `values (n, c)` of the splats, (m, c)."""
         out = np.empty((len(self.order), values.shape[1]), np.float32)
         cpu_blend.gather(values, self.order, out)
         return out
 
     def blend(self, values: np.ndarray, view: _View, least: np.float32) -> tuple[np.ndarray, np.ndarray]:
-        """Blended `values (n, c)` as (c, h, w), and alpha (h, w)."""
+        """Blend `values (n, c)` to (c, h, w); gives alpha (h, w), too."""
         image = np.empty((values.shape[1], view.height, view.width), np.float32)
         alpha = np.empty((view.height, view.width), np.float32)
         cpu_blend.blend(self.splats, self.start, self.entries, self.rows, self.in_order(values), image, alpha, least)
         return image, alpha
 
     def blend_with_moments(self, colors: np.ndarray, view: _View) -> tuple[np.ndarray, np.ndarray]:
-        """Blended `colors (n, 3)` and the moments of inverse depth as (5, h, w), and alpha (h, w)."""
+        """Blend `colors (n, 3)` and the moments of inverse depth to (5, h, w); gives alpha (h, w), too."""
         image = np.empty((cpu_depth.CHANNELS, view.height, view.width), np.float32)
         alpha = np.empty((view.height, view.width), np.float32)
         cpu_depth.blend(
@@ -165,28 +165,29 @@ class _TileLists:
         return image, alpha
 
     def median_depth(self, view: _View) -> np.ndarray:
-        """(h, w)"""
+        """Compute the median depth (h, w)."""
         depth = np.empty((view.height, view.width), np.float32)
         cpu_depth.median_depth(self.splats, self.start, self.entries, self.inverse_depths, depth)
         return depth
 
     def blend_transpose(self, image: np.ndarray, least: np.float32) -> np.ndarray:
-        """For every slot (e, c) the sum over pixels of weight times `image (c, h, w)`."""
+        """Compute for every slot the sum over pixels of weight times `image (c, h, w)`, (e, c)."""
         sums = np.empty((len(self.entries), len(image)), np.float32)
         cpu_blend.blend_transpose(self.splats, self.start, self.entries, self.rows, self.slots, image, sums, least)
         return sums
 
     def sum_slots(self, sums: np.ndarray) -> np.ndarray:
-        """Sums of entries (e, c) added up per Gaussian (n, c)."""
+        """Add up sums of entries (e, c) per Gaussian (n, c)."""
         out = np.zeros((self.count, sums.shape[1]), np.float32)
         cpu_blend.sum_slots(sums, self.first, self.order, out)
         return out
 
 
 class _RenderView(torch.autograd.Function):
-    """From raw fields and features to the blended channels (c, h, w) of one view, in the order of `CHANNEL_COUNTS`.
+    """Autograd function from raw fields and features to the blended channels (c, h, w) of one view.
 
-    Also gives alpha (h, w), the median depth (h, w; empty where it is not asked for), and what is visible (n,).
+    The channels are in the order of `CHANNEL_COUNTS`. It also gives alpha (h, w), the median depth (h, w; empty if not
+    requested), and whether each Gaussian is visible (n,).
     """
 
     @staticmethod
@@ -222,7 +223,7 @@ class _RenderView(torch.autograd.Function):
         view, lists, (values, image, alpha) = ctx.view, ctx.lists, ctx.blended
         grads = [np.zeros(field.shape, np.float32) for field in ctx.saved_tensors]
         grad_means, grad_log_scales, grad_quaternions, grad_logits, grad_sh, _ = grads
-        # columns of the sums: one for each value, and for inverse depth those of a splat
+        # columns of the sums: one per value, and for inverse depth the columns of a splat
         widths = CHANNEL_COUNTS | {"inverse_depth": cpu_project.DEPTH_COLUMNS}
         places, at = {}, cpu_blend.MOMENTS
         for name in CHANNEL_COUNTS:
@@ -251,7 +252,7 @@ class _RenderView(torch.autograd.Function):
 
 
 class FrozenView:
-    """`ViewOperator` on the CPU: tile lists of the visible splats are made once and always rendered to their ends."""
+    """`ViewOperator` on the CPU: tile lists of visible splats, made once and always rendered to their ends."""
 
     def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions, min_row_weight: float) -> None:
         """Project, sort, make tile lists, and drop hidden splats and rows."""
@@ -263,7 +264,7 @@ class FrozenView:
 
     @cached_property
     def alpha(self) -> Float[Tensor, "h w"]:
-        """Accumulated opacity in [0, 1], computed when it is first asked for."""
+        """Accumulated opacity in [0, 1], computed on first use."""
         with KERNEL_LOCK:
             nothing = np.empty((self._lists.count, 0), np.float32)
             return torch.from_numpy(self._lists.blend(nothing, self._view, cpu_blend.ALL)[1])
@@ -279,7 +280,7 @@ class FrozenView:
     def blend_and_transpose(
         self, values: Float[Tensor, "n 3"], weights: Float[Tensor, "h w"] | None
     ) -> Float[Tensor, "n 3"]:
-        """W^T (weights * W values); weights of 1 where none are given."""
+        """W^T (weights * W values); the weights are 1 by default."""
         lists, view = self._lists, self._view
         pixels = np.ones((view.height, view.width), np.float32) if weights is None else _array(weights)
         sums = np.empty((len(lists.entries), values.shape[1]), np.float32)

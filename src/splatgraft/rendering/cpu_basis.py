@@ -1,6 +1,6 @@
 """Spherical-harmonic basis values and derivatives at one direction, for numba kernels.
 
-The same functions as in `core.spherical_harmonics`, which torch evaluates; a test compares the two.
+`core.spherical_harmonics` has the same functions for torch; a test compares the two.
 """
 
 from typing import no_type_check
@@ -22,7 +22,7 @@ C30, C31, C32, C33, C35 = (
 @kernel
 @no_type_check
 def basis_at(x, y, z, k, out):
-    """Fill the first k of `out (16,)` at the unit direction x, y, z."""
+    """Fill the first k values of `out (16,)` at the unit direction x, y, z."""
     out[0] = C0
     if k > 1:
         out[1], out[2], out[3] = -C1 * y, C1 * z, -C1 * x
@@ -44,7 +44,7 @@ def basis_at(x, y, z, k, out):
 @kernel
 @no_type_check
 def basis_and_slope(x, y, z, k, out, slope):
-    """`basis_at`, and the partial derivatives in x, y, z in the first k rows of `slope (16, 3)`."""
+    """Fill `out` as `basis_at` does, and the first k rows of `slope (16, 3)` with the derivatives in x, y, z."""
     basis_at(x, y, z, k, out)
     slope[0, 0], slope[0, 1], slope[0, 2] = 0.0, 0.0, 0.0
     if k > 1:

@@ -1,8 +1,8 @@
 """Alpha blending of tile lists, forward, backward and transposed: numba kernels.
 
 A tile is processed row by row, 16 pixels at once (`cpu_simd`), in planes of float32 inside one array. Inner loops have
-no branch, call or reduction; exp is a polynomial and multiplications. For colours (3 channels) sums are held in
-registers; for any other number of channels in memory.
+no branch, call or reduction; exp is a polynomial and multiplications. Sums are held in registers for colours (3
+channels), and in memory for any other number of channels.
 """
 
 import math
@@ -33,8 +33,8 @@ RGB = 3
 MAX_ALPHA = float32(0.99)
 MIN_TRANSMITTANCE = np.float32(1e-4)
 ALL = np.float32(0)
-"""A least transmittance with which every list is rendered to its end."""
-MOMENTS = 6
+"""Bound on the transmittance with which every list is rendered to its end."""
+MOMENTS = 6  # sums of an entry for `project_backward`
 
 ONE, ZERO, HALF = float32(1), float32(0), float32(0.5)
 # alpha = exp(x)^16 with x in [log(1/255) / 16, 0]; there the polynomial is exp to 1e-7 (Chebyshev interpolation)
@@ -46,7 +46,7 @@ E0, E1, E2, E3, E4 = (float32(x) for x in (0.99999994, 0.9999898, 0.49976337, 0.
 @kernel
 @no_type_check
 def splat_shape(splats, s, x0, y0):
-    """Centre in the tile, the quadratic's a, b, c and constant over 16, first and one past the last row."""
+    """Compute a splat's centre in the tile, quadratic a, b, c and constant over 16, first and one past the last row."""
     mx, my = splats[s, MX] - x0 - HALF, splats[s, MY] - y0 - HALF
     # a thousandth of a pixel covers rounding, and each pixel is tested exactly; truncation is floor above 0
     reach = splats[s, REACH_Y] + float32(1e-3)
@@ -59,7 +59,7 @@ def splat_shape(splats, s, x0, y0):
 @kernel
 @no_type_check
 def kept_rows(rows, k, top, bottom):
-    """First and one past the last row of entry k: those of `rows (e, 2)`, or `top` and `bottom` where it is empty."""
+    """Return the first and one past the last row of entry k from `rows (e, 2)`, or `top`, `bottom` if that is empty."""
     if rows.shape[0] > 0:
         return int(rows[k, 0]), int(rows[k, 1])
     return top, bottom
@@ -68,7 +68,7 @@ def kept_rows(rows, k, top, bottom):
 @kernel
 @no_type_check
 def alpha_row(across, dx, along, down):
-    """A row of alpha before the cap, 0 below 1/255, of the exponent `across` + `along` dx + `down` (all over 16)."""
+    """Compute a row of alpha, not capped, 0 below 1/255; its exponent over 16 is `across` + `along` dx + `down`."""
     x = across + dx * along + down
     e = (((x * E4 + E3) * x + E2) * x + E1) * x + E0
     e = e * e
@@ -81,7 +81,7 @@ def alpha_row(across, dx, along, down):
 @kernel
 @no_type_check
 def saturated(work, least):
-    """Whether the transmittance of all pixels of the tile is below `least`."""
+    """Test whether the transmittance of all pixels of the tile is below `least`."""
     most = load(work, 0)
     for y in range(1, TILE):
         most = larger(most, load(work, y * TILE))
@@ -138,7 +138,7 @@ def _blend_any(splats, entries, rows, values, x0, y0, work, least):
 @kernel
 @no_type_check
 def open_tile(tile, width, planes):
-    """Corner of the tile, and its planes: transmittance 1, the others 0."""
+    """Return the corner of the tile and its planes: transmittance 1, the others 0."""
     tiles_x = (width + TILE - 1) // TILE
     work = np.zeros(planes * PIXELS, np.float32)
     work[:PIXELS] = ONE
@@ -150,8 +150,8 @@ def open_tile(tile, width, planes):
 def blend(splats, start, entries, rows, values, image, alpha, least):
     """Fill `image (c, h, w)` with blended `values (m, c)` over black, and `alpha (h, w)`.
 
-    `rows (e, 2)`: first and one past the last row of each entry that counts; empty: as far as the splat reaches. A tile
-    is done when every pixel's transmittance is below `least`; tested once per batch of splats.
+    `rows (e, 2)`: first and one past the last row of each entry that counts; empty if all rows of the splat count. A
+    tile is done when every pixel's transmittance is below `least`; this is tested once per batch of splats.
     """
     channels = values.shape[1]
     for tile in prange(start.shape[0] - 1):
@@ -207,7 +207,7 @@ def _transpose_rgb(splats, entries, rows, slots, x0, y0, work, sums, least):
 @kernel
 @no_type_check
 def _transpose_any(splats, entries, rows, slots, x0, y0, work, sums, least):
-    """Planes of `work`: transmittance, the channels of the image, one for sums (at most 256 channels in rows)."""
+    """Planes of `work`: transmittance, then the channels of the image."""
     channels = sums.shape[1]
     column = np.empty(channels * TILE, np.float32)
     for k in range(entries.shape[0]):
@@ -237,7 +237,7 @@ def _transpose_any(splats, entries, rows, slots, x0, y0, work, sums, least):
 def blend_transpose(splats, start, entries, rows, slots, image, sums, least):
     """Fill `sums (e, c)`: for every entry, the sum over its pixels of weight times `image (c, h, w)`.
 
-    `rows` as in `blend`.
+    `rows` has the meaning that it has in `blend`.
     """
     channels = image.shape[0]
     for tile in prange(start.shape[0] - 1):
@@ -257,7 +257,7 @@ def blend_transpose(splats, start, entries, rows, slots, image, sums, least):
 @kernel
 @no_type_check
 def write_moments(sums, slot, dx, s0, sy, syy):
-    """Moments of an entry from its sums by column: of the exponent's gradient, times dy, times dy squared."""
+    """Write an entry's moments from column sums: of the exponent's gradient, of it times dy, and times dy squared."""
     sx = s0 * dx
     sums[slot, 0], sums[slot, 1], sums[slot, 2] = total(s0), total(sx), total(sy)
     sums[slot, 3], sums[slot, 4], sums[slot, 5] = total(sx * dx), total(sy * dx), total(syy)
@@ -266,7 +266,7 @@ def write_moments(sums, slot, dx, s0, sy, syy):
 @kernel
 @no_type_check
 def exponent_gradient(uncapped, alpha, before, value, left):
-    """Gradient of the loss by the exponent for a row: 0 where alpha is capped."""
+    """Compute the gradient of the loss by the exponent for a row; 0 where alpha is capped."""
     return where_below(uncapped, MAX_ALPHA, alpha * (before * value - left / (ONE - alpha)))
 
 
@@ -349,7 +349,7 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
 @kernel
 @no_type_check
 def open_rest(image, alpha, grad_image, grad_alpha, x0, y0, work):
-    """Fill plane 1 of the tile with the contribution of what lies behind the first splat: gradient times pixel."""
+    """Fill plane 1 of the tile with gradient times pixel, summed over channels and alpha: the part of all splats."""
     for y in range(y0, min(y0 + TILE, alpha.shape[0])):
         for x in range(x0, min(x0 + TILE, alpha.shape[1])):
             rest = grad_alpha[y, x] * alpha[y, x]
@@ -361,7 +361,7 @@ def open_rest(image, alpha, grad_image, grad_alpha, x0, y0, work):
 @kernel(parallel=True)
 @no_type_check
 def blend_backward(splats, start, entries, slots, values, image, alpha, grad_image, grad_alpha, sums, least):
-    """Fill `sums (e, 6 + c)`: for every entry its moments for `project_backward`, and its values' gradients."""
+    """Fill `sums (e, 6 + c)`: for every entry the moments for `project_backward`, and the gradients of its values."""
     channels = values.shape[1]
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = open_tile(tile, alpha.shape[1], 3 + channels)

@@ -1,9 +1,9 @@
 """Depth on the CPU: the median depth of each pixel, and moments of inverse depth along each ray: numba kernels.
 
-Inverse depth is linear in the pixel for a plane, so that a flat Gaussian has the depth of its plane in every pixel that
-it covers (`inverse_depths` of `cpu_project.project`), not that of its centre. Its moments along a ray are blended like
-colours, in the same pass: sum of w c, and sum of w (c^2 + v) with c and v the mean and the variance of each Gaussian's
-inverse depth and w its blending weight. Inner loops are those of `cpu_blend`.
+The inverse depth of a plane is linear in the pixel. So a flat Gaussian has the depth of its plane in every pixel that
+it covers (`inverse_depths` of `cpu_project.project`), not the depth of its centre. The moments are sums of w c and of
+w (c^2 + v), blended like colours in the same pass. w is a Gaussian's blending weight; c and v are the mean and the
+variance of its inverse depth.
 """
 
 from typing import no_type_check
@@ -42,10 +42,9 @@ from splatgraft.rendering.cpu_simd import (
 from splatgraft.rendering.cpu_tiles import TILE
 from splatgraft.runtime.kernels import kernel
 
-CHANNELS = 5
-"""Red, green, blue, and the two moments of inverse depth."""
+CHANNELS = 5  # red, green, blue, and the two moments of inverse depth
 _LEAST, _MOST = float32(1 / 4), float32(4)
-"""Bounds on inverse depth over that at the centre: the faint rim of a wide splat reaches beyond its plane's horizon."""
+"""Bounds on inverse depth, over the one at the centre: a wide splat's faint rim reaches beyond its plane's horizon."""
 
 
 @kernel(parallel=True)
@@ -179,8 +178,7 @@ def _backward_tile(splats, entries, slots, values, inverse_depths, x0, y0, work,
 def blend_backward(
     splats, start, entries, slots, values, inverse_depths, image, alpha, grad_image, grad_alpha, sums, least
 ):  # fmt: skip
-    """Fill `sums (e, 6 + 3 + 4)`: for every entry its moments for `project_backward`, and the gradients of its values
-    and of its inverse depth."""
+    """Fill `sums (e, 6 + 3 + 4)`: for every entry the moments, and the gradients of values and inverse depth."""
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = open_tile(tile, alpha.shape[1], 3 + CHANNELS)
         listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]

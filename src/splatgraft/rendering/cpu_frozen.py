@@ -1,7 +1,7 @@
-"""Views with frozen geometry: rows in which a splat has weight, and blending with its transpose in one pass: numba.
+"""Views with frozen geometry: numba kernels that find the rows of a splat with weight, and apply W^T W in one pass.
 
-Behind an opaque surface a splat's weights are all but 0 in most rows that it reaches, so that these are found once. All
-pixels of a tile are drawn by the tile's own list, so that W^T W needs no image, and each weight is computed once.
+Behind an opaque surface a splat's weights are almost 0 in most of its rows; the others are found once. W^T W is applied
+tile by tile: a tile's list draws all of its pixels, so that no whole image is needed and each weight is computed once.
 """
 
 from typing import no_type_check
@@ -32,8 +32,8 @@ from splatgraft.runtime.kernels import kernel
 def find_rows(splats, start, entries, size, min_weight, rows):
     """Fill `rows (e, 2)`: first and one past the last row of each entry with more weight than a bound.
 
-    `size`: height and width of the image, outside of which nothing counts. Both are 0 for entries without such a row.
-    A tile is done when every pixel's transmittance is below `MIN_TRANSMITTANCE`.
+    `size`: height and width of the image; pixels outside count nothing. Both numbers are 0 for entries without such a
+    row. A tile is done when every pixel's transmittance is below `MIN_TRANSMITTANCE`.
     """
     height, width = size
     for tile in prange(start.shape[0] - 1):
@@ -63,7 +63,7 @@ def find_rows(splats, start, entries, size, min_weight, rows):
 @kernel
 @no_type_check
 def _count(rows):
-    """Rows of all entries together, at least 1."""
+    """Count the rows of all entries; at least 1."""
     count = 0
     for k in range(rows.shape[0]):
         count += int(rows[k, 1]) - int(rows[k, 0])
@@ -128,7 +128,7 @@ def blend_and_transpose(splats, start, entries, rows, slots, values, pixel_weigh
 @kernel
 @no_type_check
 def _blend_one_and_keep(splats, entries, rows, values, x0, y0, work, weights):
-    """The same blending as `_blend_and_keep` for one channel: planes transmittance and value."""
+    """Blend one channel as `_blend_and_keep` does three: planes transmittance and value."""
     kept = 0
     for k in range(entries.shape[0]):
         s = entries[k]

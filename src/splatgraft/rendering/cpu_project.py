@@ -17,21 +17,21 @@ MIN_ALPHA = 1.0 / 255.0
 BLOCK = 256
 ZERO, HALF = float32(0), float32(0.5)
 
-# columns of a splat
+# columns of a splat: centre (pixels), conic, log opacity, half width and half height (pixels)
 MX, MY, CA, CB, CC, LOG_OPACITY, REACH_X, REACH_Y = range(8)
 COLUMNS = 8
-# columns of a splat's inverse depth: at its centre, its slopes per pixel, its variance along a ray
+# columns of a splat's inverse depth: value at the centre, slopes per pixel, variance along a ray
 AT_CENTER, SLOPE_X, SLOPE_Y, ALONG_RAY = range(4)
 DEPTH_COLUMNS = 4
 
-# places in a camera vector: rotation (9) and translation (3) of camera_from_world, centre (3), then
+# indices in a camera vector, after rotation (9) and translation (3) of camera_from_world and the centre (3)
 FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, NEAR, WIDTH, HEIGHT, LOW_PASS = range(15, 27)
 
 
 @kernel
 @no_type_check
 def _rotation(quaternion, out):
-    """Fill the 3x3 matrix of a wxyz quaternion, the identity for one of length 0. Returns one over the length."""
+    """Fill the 3x3 matrix of a wxyz quaternion; length 0 gives the identity. Returns one over the length."""
     w, x, y, z = float(quaternion[0]), float(quaternion[1]), float(quaternion[2]), float(quaternion[3])
     inverse = 1.0 / max(math.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
@@ -55,7 +55,7 @@ def _view_axes(log_scales, rotation, camera, out):
 @kernel
 @no_type_check
 def _normal_axis(log_scales, rotation, offset):
-    """Index of the shortest axis, and the sign that turns it to the camera; `offset` is centre minus camera."""
+    """Find the index of the shortest axis and the sign that turns it to the camera; `offset` is centre minus camera."""
     axis = 0
     for j in range(1, 3):
         if log_scales[j] < log_scales[axis]:
@@ -80,7 +80,7 @@ def _camera_point(mean, camera, offset):
 @kernel
 @no_type_check
 def _jacobian(x, y, z, camera):
-    """Non-zero entries J00, J02, J11, J12, and whether the point is inside the clamping bounds in x and in y."""
+    """Compute the non-zero entries J00, J02, J11, J12, and whether the point is within the clamping bounds in x, y."""
     u, v = x / z, y / z
     held_u = min(max(u, camera[LOW_X]), camera[HIGH_X])
     held_v = min(max(v, camera[LOW_Y]), camera[HIGH_Y])
@@ -93,8 +93,8 @@ def _jacobian(x, y, z, camera):
 def project(means, log_scales, quaternions, opacity_logits, camera, antialiased, splats, depths, inverse_depths):
     """Fill `splats (n, 8)` and `depths (n,)`; a splat outside the image or too transparent has log opacity -inf.
 
-    Fill `inverse_depths (n, 4)` unless it is empty: the Gaussian's 1 / z given the pixel, which is linear in the pixel
-    because screen position and 1 / z of a plane are (as in RaDe-GS, Zhang et al. 2024), and its variance.
+    Fill `inverse_depths (n, 4)` unless it is empty: mean and variance of the Gaussian's 1 / z given the pixel. The mean
+    is linear in the pixel, as 1 / z of a plane is (compare RaDe-GS, Zhang et al. 2024).
     """
     n, low = means.shape[0], camera[LOW_PASS]
     for block in prange((n + BLOCK - 1) // BLOCK):
@@ -148,7 +148,7 @@ def project(means, log_scales, quaternions, opacity_logits, camera, antialiased,
 @kernel(parallel=True)
 @no_type_check
 def shade(means, sh, drawn, camera, colors):
-    """Fill `colors (n, 3)` as the camera sees them where `drawn (n,)`."""
+    """Fill `colors (n, 3)` with the colours towards the camera where `drawn (n,)`."""
     n, k = sh.shape[0], sh.shape[1]
     for block in prange((n + BLOCK - 1) // BLOCK):
         basis = np.empty(16, np.float32)
@@ -183,7 +183,7 @@ def normals(means, log_scales, quaternions, drawn, camera, out):
 @kernel(parallel=True)
 @no_type_check
 def shade_backward(means, sh, drawn, camera, totals, at, grad_means, grad_sh):
-    """Add the gradients of `shade`, which are columns from `at` of `totals (n, ..)`, to `grad_means` and `grad_sh`."""
+    """Add the gradients of `shade` to `grad_means` and `grad_sh`; those of colours begin at column `at` of `totals`."""
     n, k = sh.shape[0], sh.shape[1]
     for block in prange((n + BLOCK - 1) // BLOCK):
         basis, slope, along = np.empty(16, np.float32), np.empty((16, 3), np.float32), np.empty(16, np.float32)
@@ -218,7 +218,7 @@ def shade_backward(means, sh, drawn, camera, totals, at, grad_means, grad_sh):
 @kernel
 @no_type_check
 def _add_quaternion_gradient(quaternion, inverse, d, out):
-    """Gradient of a rotation matrix (3x3 `d`) to the raw wxyz quaternion, through its normalisation."""
+    """Add the gradient by the raw wxyz quaternion, given the gradient `d` (3x3) by its rotation matrix."""
     w, x, y, z = quaternion[0] * inverse, quaternion[1] * inverse, quaternion[2] * inverse, quaternion[3] * inverse
     gw = 2 * (x * (d[2, 1] - d[1, 2]) + y * (d[0, 2] - d[2, 0]) + z * (d[1, 0] - d[0, 1]))
     gx = 2 * (y * (d[0, 1] + d[1, 0]) + z * (d[0, 2] + d[2, 0]) + w * (d[2, 1] - d[1, 2]) - 2 * x * (d[1, 1] + d[2, 2]))
@@ -237,11 +237,11 @@ def project_backward(
     means, log_scales, quaternions, opacity_logits, drawn, camera, antialiased, totals, depth_at, normal_at,
     grad_means, grad_log_scales, grad_quaternions, grad_opacity_logits,
 ):  # fmt: skip
-    """Add the gradients of `project`, given those of the splats, to the gradients of the raw fields.
+    """Add the gradients of `project` to the gradients of the raw fields, given those of the splats.
 
-    `totals (n, ..)`: first sums over pixels of dL/d(exponent) times 1, dx, dy, dx^2, dx dy, dy^2, with d from centre
-    to pixel; gradients of the four columns of inverse depth and of the normal from columns `depth_at` and `normal_at`,
-    unless 0.
+    `totals (n, ..)` begins with sums over pixels of dL/d(exponent) times 1, dx, dy, dx^2, dx dy, dy^2, where d goes
+    from the centre to the pixel. The gradients of the four columns of inverse depth begin at column `depth_at`, those
+    of the normal at `normal_at`; 0 means that there are none.
     """
     n, low = means.shape[0], camera[LOW_PASS]
     for block in prange((n + BLOCK - 1) // BLOCK):
@@ -278,7 +278,7 @@ def project_backward(
                 d_yy += to_sharp * xx + to_blurred * (xx + low)
                 d_xy -= 2 * xy * (to_sharp + to_blurred)
 
-            # gradients by the covariances of 1 / z with the pixel, and twice that by its variance
+            # gradients by the covariances of 1 / z with the pixel, and twice the gradient by its variance
             d_cross_x, d_cross_y, d_own, d_inverse_depth = 0.0, 0.0, 0.0, 0.0
             if depth_at > 0 and free_x and free_y:
                 cross_x, cross_y = 0.0, 0.0

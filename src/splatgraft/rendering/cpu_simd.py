@@ -1,8 +1,8 @@
 """A SIMD type for numba kernels: a row of 16 float32 as one LLVM vector value.
 
-The compiler vectorises loops only where it can prove independence, and short ones badly; with this type kernels are
-vectorised explicitly. Rows add, subtract, multiply and divide with each other and with float32 scalars. LLVM maps them
-to the SIMD registers of the machine.
+The compiler vectorises loops only if it can prove independence, and vectorises short ones badly. This type vectorises
+kernels explicitly. Rows add, subtract, multiply and divide with each other and with float32 scalars. LLVM maps them to
+the SIMD registers of the machine.
 """
 
 import operator
@@ -76,7 +76,7 @@ def _place(context, builder, array_type, array, at):
 @intrinsic
 @no_type_check
 def load(_typing, array, at):
-    """The row of a contiguous float32 array that begins at flat index `at`."""
+    """Read the row of a contiguous float32 array that begins at flat index `at`."""
 
     def generate(context, builder, sig, args):
         return builder.load(_place(context, builder, sig.args[0], args[0], args[1]), align=4)
@@ -99,14 +99,14 @@ def store(_typing, array, at, row):
 @intrinsic
 @no_type_check
 def broadcast(_typing, value):
-    """A row with one float32 in all lanes."""
+    """Make a row with one float32 in all lanes."""
     return _ROW(types.float32), lambda _context, builder, _signature, args: _broadcast(builder, args[0])
 
 
 @intrinsic
 @no_type_check
 def lanes(_typing):
-    """The row 0, 1, .., 15."""
+    """Make the row 0, 1, .., 15."""
 
     def generate(_context, _builder, _signature, _args):
         return ir.Constant(_VECTOR, [ir.Constant(ir.FloatType(), float(x)) for x in range(LANES)])
@@ -117,7 +117,7 @@ def lanes(_typing):
 @intrinsic
 @no_type_check
 def smaller(_typing, row, bound):
-    """The lesser of each lane and a scalar."""
+    """Take the lesser of each lane and a scalar."""
 
     def generate(_context, builder, _signature, args):
         other = _broadcast(builder, args[1])
@@ -129,7 +129,7 @@ def smaller(_typing, row, bound):
 @intrinsic
 @no_type_check
 def larger(_typing, row, other):
-    """The greater of two rows, lane by lane."""
+    """Take the greater of two rows, lane by lane."""
 
     def generate(_context, builder, _signature, args):
         return builder.select(builder.fcmp_ordered(">", args[0], args[1]), args[0], args[1])
@@ -140,7 +140,7 @@ def larger(_typing, row, other):
 @intrinsic
 @no_type_check
 def where_at_least(_typing, tested, bound, row):
-    """`row` in the lanes where `tested` is at least the scalar `bound`, else 0; 0 where it is nan."""
+    """Take `row` in the lanes where `tested` is at least the scalar `bound`, else 0; nan gives 0."""
 
     def generate(_context, builder, _signature, args):
         inside = builder.fcmp_ordered(">=", args[0], _broadcast(builder, args[1]))
@@ -152,7 +152,7 @@ def where_at_least(_typing, tested, bound, row):
 @intrinsic
 @no_type_check
 def where_below(_typing, tested, bound, row):
-    """`row` in the lanes where `tested` is below the scalar `bound`, else 0."""
+    """Take `row` in the lanes where `tested` is below the scalar `bound`, else 0."""
 
     def generate(_context, builder, _signature, args):
         inside = builder.fcmp_ordered("<", args[0], _broadcast(builder, args[1]))
@@ -176,12 +176,12 @@ def _reduce(name, takes_start):
 @intrinsic
 @no_type_check
 def total(_typing, row):
-    """Sum of the lanes."""
+    """Add the lanes."""
     return types.float32(row), _reduce("fadd", takes_start=True)
 
 
 @intrinsic
 @no_type_check
 def largest(_typing, row):
-    """Greatest of the lanes."""
+    """Take the greatest lane."""
     return types.float32(row), _reduce("fmax", takes_start=False)

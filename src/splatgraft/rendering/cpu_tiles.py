@@ -16,7 +16,7 @@ _DIGIT_BITS = 11
 @kernel
 @no_type_check
 def depth_order(splats, depths):
-    """Indices of the splats with a finite log opacity, nearest first; equal depths stay in index order."""
+    """Sort the splats with a finite log opacity by depth, nearest first; equal depths stay in index order."""
     n = depths.shape[0]
     keys, order = np.empty(n, np.uint32), np.empty(n, np.int32)
     bits = depths.view(np.uint32)
@@ -47,7 +47,7 @@ def depth_order(splats, depths):
 @kernel
 @no_type_check
 def _tile_span(splat, row, tiles_x):
-    """First and one past the last tile of tile row `row` that the ellipse alpha >= 1/255 meets."""
+    """Compute the first and one past the last tile of tile row `row` that the ellipse alpha >= 1/255 meets."""
     my = float(splat[MY])
     low, high = row * TILE - my, (row + 1) * TILE - my
     # the ellipse is a x^2 + 2 b x y + c y^2 <= limit; its rightmost point has y = -b / c * x
@@ -68,17 +68,17 @@ def _tile_span(splat, row, tiles_x):
 @kernel
 @no_type_check
 def _tile_rows(splat, tiles_y):
-    """First and one past the last tile row that the ellipse can meet."""
+    """Compute the first and one past the last tile row that the ellipse can meet."""
     top = (splat[MY] - splat[REACH_Y] - 1e-3) / TILE
     bottom = (splat[MY] + splat[REACH_Y] + 1e-3) / TILE
-    # truncation is floor, as nothing is below 0
+    # truncation is floor, because no value is below 0
     return int(max(min(top, 1e6), 0.0)), int(max(min(bottom + 1.0, float(tiles_y)), 0.0))
 
 
 @kernel(parallel=True)
 @no_type_check
 def _spans(packed, first_row, tiles_x, tiles_y):
-    """The tiles of every splat, row by row, as first and one past the last; a splat's rows begin at `first_row`."""
+    """Compute the tiles of every splat, row by row, as first and one past the last; its rows begin at `first_row`."""
     spans = np.empty((first_row[-1], 2), np.int32)
     for s in prange(packed.shape[0]):
         top, bottom = _tile_rows(packed[s], tiles_y)
@@ -92,10 +92,14 @@ def _spans(packed, first_row, tiles_x, tiles_y):
 @kernel
 @no_type_check
 def bin_splats(splats, order, width, height):
-    """Sorted splats, their tile lists, and the position of each splat's entries.
+    """Sort the splats by `order` and list them tile by tile.
 
-    Returns `sorted (m, 8)`; `start (tiles + 1,)` into `entries (e,)` (splat index, nearest first) and `slots (e,)`
-    (one index per entry, such that the slots of splat s are `first[s]` to `first[s + 1]`, `first (m + 1,)`).
+    Returns:
+        sorted: (m, 8) splats.
+        start: (tiles + 1,) begin of each tile's list in `entries` and `slots`.
+        entries: (e,) index of the splat, nearest first.
+        slots: (e,) row of the entry's sums; splat s has the rows `first[s]` to `first[s + 1]`.
+        first: (m + 1,) begin of each splat's slots.
     """
     m = order.shape[0]
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE

@@ -1,4 +1,4 @@
-"""Rendering on CUDA by gsplat's `rasterization`; median depth, which it does not have, by the CPU's kernels."""
+"""Rendering on CUDA by gsplat's `rasterization`, and median depth, which gsplat lacks, by the CPU's kernels."""
 
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
@@ -23,9 +23,10 @@ def render(
     features: Float[Tensor, "n f"] | None,
     options: RenderOptions,
 ) -> Render:
-    """`rendering.render` for tensors on a CUDA device.
+    """Render as `rendering.render` does, for tensors on a CUDA device.
 
-    Raises: ValueError where gsplat is not installed.
+    Raises:
+        ValueError: gsplat is not installed.
     """
     drawn = []
     for camera in cameras:
@@ -41,7 +42,7 @@ def render(
 def _median_depth(
     gaussians: Gaussians, camera: Cameras, outputs: AbstractSet[Output], options: RenderOptions
 ) -> Float[Tensor, "h w"]:
-    """Median depth by the CPU's kernels, because gsplat has none for 3D Gaussians; empty where it is not asked for."""
+    """Compute median depth by the CPU's kernels, because gsplat has none for 3D Gaussians; empty if not requested."""
     if "depth" not in outputs:
         return gaussians.means.new_zeros(0, 0)
     on_cpu = gaussians.map(lambda tensor: tensor.detach().cpu())
@@ -52,9 +53,9 @@ def _median_depth(
 def inverse_depth_planes(
     gaussians: Gaussians, camera: Cameras, options: RenderOptions
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Mean of each Gaussian's inverse depth as a linear function of the pixel, and its variance given the pixel.
+    """Compute the mean of each Gaussian's inverse depth as a linear function of the pixel, and its variance.
 
-    `cpu_project.project` computes the same.
+    `cpu_project.project` computes the same numbers.
 
     Returns:
         Coefficients of 1, (x - cx) / fx and (y - cy) / fy, per world unit; variances, per world unit squared.
@@ -79,20 +80,20 @@ def inverse_depth_planes(
     variance = covariance[:, 2, 2] - (slope * covariance[:, :2, 2]).sum(1)
     at_axis = 1 / z - (slope * center).sum(1)
     planes = torch.cat([at_axis[:, None], slope], 1)
-    # the plane of a Gaussian whose centre is out of view is extrapolated: no gradient, as in the CPU's kernels
+    # the plane of a Gaussian is extrapolated if its centre is out of view: no gradient, as in the CPU's kernels
     in_view = (held == center).all(1)
     return torch.where(in_view[:, None], planes, planes.detach()), torch.where(in_view, variance, variance.detach())
 
 
 def moment_channels(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> Float[Tensor, "n 9"]:
-    """Values whose blended sums give both moments: c = a + b x + d y, and the products of a, b, d for c^2 + v."""
+    """Compute values whose blended sums give both moments: a, b, d of c = a + b x + d y, and products for c^2 + v."""
     planes, variance = inverse_depth_planes(gaussians, camera, options)
     a, b, d = planes.unbind(1)
     return torch.cat([planes, torch.stack([a * a + variance, a * b, a * d, b * b, b * d, d * d], 1)], 1)
 
 
 def moments(sums: Float[Tensor, "h w 9"], camera: Cameras) -> Float[Tensor, "h w 2"]:
-    """Moments of inverse depth from the blended channels of `moment_channels`."""
+    """Compute the moments of inverse depth from the blended channels of `moment_channels`."""
     x, y, _ = camera.rays().to(sums).unbind(-1)
     a, b, d, aa, ab, ad, bb, bd, dd = sums.unbind(-1)
     first = a + b * x + d * y
@@ -101,16 +102,16 @@ def moments(sums: Float[Tensor, "h w 9"], camera: Cameras) -> Float[Tensor, "h w
 
 
 class FrozenView:
-    """`ViewOperator` on CUDA: gsplat keeps no tile lists between calls, so each call rasterises again."""
+    """`ViewOperator` on CUDA; each call rasterises again, because gsplat keeps no tile lists between calls."""
 
     def __init__(self, gaussians: Gaussians, camera: Cameras, options: RenderOptions, _min_row_weight: float) -> None:
-        """Freeze geometry and opacity; gsplat leaves no row out."""
+        """Freeze geometry and opacity; no row is left out."""
         self._gaussians, self._camera, self._options = gaussians.map(Tensor.detach), camera, options
         _, self.alpha, _ = self._draw(gaussians.means.new_zeros(gaussians.count, 1))
 
     @cached_property
     def visible(self) -> Bool[Tensor, "n"]:
-        """Which Gaussians have any weight in the view."""
+        """Whether each Gaussian has weight in some pixel."""
         return (self.blend_transpose(torch.ones_like(self.alpha)[..., None]) > 0)[:, 0]
 
     def blend(self, values: Float[Tensor, "n c"]) -> Float[Tensor, "h w c"]:
@@ -126,7 +127,7 @@ class FrozenView:
     def blend_and_transpose(
         self, values: Float[Tensor, "n 3"], weights: Float[Tensor, "h w"] | None
     ) -> Float[Tensor, "n 3"]:
-        """W^T (weights * W values); weights of 1 where none are given."""
+        """W^T (weights * W values); the weights are 1 by default."""
         image = self.blend(values)
         return self.blend_transpose(image if weights is None else image * weights[..., None])
 
@@ -141,7 +142,7 @@ class FrozenView:
 def _draw(
     gaussians: Gaussians, camera: Cameras, values: Tensor, options: RenderOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Blended `values (n, c)` as (h, w, c) over black, alpha (h, w) and what is visible (n,), for one camera."""
+    """Blend `values (n, c)` to (h, w, c) over black; also gives alpha (h, w) and whether Gaussians are visible (n,)."""
     if gaussians.count == 0:
         blank = values.new_zeros(camera.height, camera.width, values.shape[1])
         return blank, blank.new_zeros(blank.shape[:2]), torch.zeros(0, dtype=torch.bool, device=values.device)
@@ -167,7 +168,7 @@ def _draw(
 def _channels(
     gaussians: Gaussians, camera: Cameras, outputs: AbstractSet[Output], features: Tensor | None
 ) -> Float[Tensor, "n c"]:
-    """What `CHANNEL_COUNTS` lists, per Gaussian."""
+    """Compute the channels of `CHANNEL_COUNTS` per Gaussian, then the features."""
     offset = gaussians.means - camera.centers[0].to(gaussians.means)
     parts = []
     if "color" in outputs:

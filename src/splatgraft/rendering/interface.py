@@ -1,4 +1,4 @@
-"""Rendering of Gaussians: options, results, the choice of the implementation by device, and what all of them share."""
+"""Rendering of Gaussians: options, results, and the choice of the implementation by device."""
 
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
@@ -16,33 +16,33 @@ from splatgraft.core.gaussians import Gaussians
 
 Output = Literal["color", "depth", "inverse_depth", "normal"]
 CHANNEL_COUNTS: dict[Output, int] = {"color": 3, "inverse_depth": 2, "normal": 3}
-"""Number of channels of each blended output, in this order; features follow. Depth is not blended."""
+"""Number of channels of each blended output, in this order; features follow. Median depth is not blended."""
 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How a scene is drawn."""
+    """Options of the renderer."""
 
     low_pass: Literal["classic", "antialiased"] = "classic"
     """Both widen the covariance; `antialiased` also scales opacity by the area ratio (Mip-Splatting)."""
     low_pass_px2: float = 0.3
-    """Variance added to projected covariances, pixels squared; 0.3 (3DGS) where a pixel's neighbours are drawn too."""
+    """Variance added to projected covariances, pixels squared; 0.3 (3DGS) for whole images."""
     near: float = 0.01
-    """Gaussians whose centre is nearer than this along the optical axis are not drawn, world units."""
+    """Depth below which Gaussians, by their centres, are not drawn, world units."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """sRGB behind the scene."""
 
 
 @dataclass(frozen=True)
 class Render:
-    """Pictures of one scene from v cameras of one size; reading one that was not asked for raises a ValueError."""
+    """Pictures of one scene from v cameras of one size; reading an output that was not requested raises ValueError."""
 
     alpha: Float[Tensor, "v h w"]
     """Accumulated opacity in [0, 1]."""
     visible: Bool[Tensor, "v n"]
-    """Which Gaussians reach at least one pixel's tile list of that view."""
+    """Whether each Gaussian is in some tile's list of that view."""
     pictures: Mapping[str, Float[Tensor, "v h w ..."]]
-    """By name: the outputs asked for, and "features" where features were given."""
+    """Pictures by name: the requested outputs, and "features" if features were given."""
 
     @property
     def color(self) -> Float[Tensor, "v h w 3"]:
@@ -51,15 +51,17 @@ class Render:
 
     @property
     def depth(self) -> Float[Tensor, "v h w"]:
-        """Median depth along the optical axis, world units: where the transmittance falls below one half. 0 if it never
-        does, which is where alpha is below one half. It has no gradient."""
+        """Median depth along the optical axis, world units: the depth at which the transmittance falls below one half.
+
+        It is 0 where alpha is below one half, and has no gradient.
+        """
         return self._asked("depth")
 
     @property
     def inverse_depth(self) -> Float[Tensor, "v h w 2"]:
         """First and second moment of inverse depth along each ray, per world unit and its square.
 
-        They are sums over Gaussians of w c and of w (c^2 + v), not divided by alpha: w is the blending weight, c and v
+        They are sums over Gaussians of w c and of w (c^2 + v), not divided by alpha. w is the blending weight; c and v
         are the mean and the variance of the Gaussian's inverse depth in this pixel.
         """
         return self._asked("inverse_depth")
@@ -77,7 +79,7 @@ class Render:
     def _asked(self, name: str) -> Tensor:
         if name not in self.pictures:
             found = ", ".join(self.pictures) or "none"
-            raise ValueError(f"render: expected {name} among what was asked for, found {found}")
+            raise ValueError(f"render: expected {name} among the requested outputs, found {found}")
         return self.pictures[name]
 
 
@@ -86,7 +88,7 @@ class ViewOperator(Protocol):
     """The fixed linear map W from Gaussian values to pixels of one view: geometry and opacity are frozen."""
 
     visible: Bool[Tensor, "n"]
-    """Which Gaussians have weight in some pixel."""
+    """Whether each Gaussian has weight in some pixel."""
 
     @property
     def alpha(self) -> Float[Tensor, "h w"]:
@@ -104,7 +106,7 @@ class ViewOperator(Protocol):
     def blend_and_transpose(
         self, values: Float[Tensor, "n 3"], weights: Float[Tensor, "h w"] | None
     ) -> Float[Tensor, "n 3"]:
-        """W^T (weights * W values), in which pixels count by `weights`; all alike where none are given."""
+        """W^T (weights * W values), with a weight for each pixel; 1 by default."""
         ...
 
     def transpose_residual(self, values: Float[Tensor, "n"], target: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
@@ -125,15 +127,15 @@ def render(
     Args:
         gaussians: n Gaussians, on the CPU (numba) or a CUDA device (gsplat).
         cameras: v cameras that share one image size.
-        outputs: Which of color, depth, inverse_depth and normal to render; inverse_depth goes with color alone.
-        features: f values per Gaussian that are blended like colours.
+        outputs: The outputs to render: color, depth, inverse_depth, normal; inverse_depth excludes normal.
+        features: f values per Gaussian that are blended like colours; not with inverse_depth.
         options: Low-pass filter, near plane and background.
 
     Returns:
-        The pictures that were asked for, with opacity and visibility, on the device of `gaussians`.
+        The requested outputs, with opacity and visibility, on the device of `gaussians`.
 
     Raises:
-        ValueError: The cameras' image sizes differ, gsplat is not installed, or inverse_depth is asked for with
+        ValueError: The cameras' image sizes differ, gsplat is not installed, or inverse_depth is requested with
             normals or features.
     """
     if "inverse_depth" in outputs and (features is not None or not outputs <= {"color", "depth", "inverse_depth"}):
@@ -141,7 +143,7 @@ def render(
     if "inverse_depth" in outputs:
         outputs = frozenset[Output]({*outputs, "color"})  # they are blended in one pass
     implementation = _implementation(gaussians)
-    _ = cameras.width  # refuses what cannot be stacked
+    _ = cameras.width  # refuses images that cannot be stacked
     return implementation.render(gaussians, cameras, outputs=outputs, features=features, options=options)
 
 
@@ -152,17 +154,21 @@ def view_operator(
     *,
     min_row_weight: float = 0.0,
 ) -> ViewOperator:
-    """The map from Gaussian values to the pixels of one camera, with depth order and tile lists computed once.
+    """Make the map from Gaussian values to the pixels of one camera; depth order and tile lists are computed once.
 
-    The weights of a Gaussian in 16 neighbouring pixels of a row that add up to no more than `min_row_weight` count as 0
-    where they are its first or last in a tile of 16 rows; behind opaque surfaces most rows are so. 0 is exact. On CUDA
-    nothing is left out.
+    Args:
+        gaussians: n Gaussians, on the CPU or a CUDA device.
+        camera: One camera.
+        options: Low-pass filter and near plane.
+        min_row_weight: Bound on a sum of weights; 0 is exact. In each tile of 16x16 pixels, a Gaussian's first and last
+            rows are dropped while the weights of the row's 16 pixels add up to no more. Behind opaque surfaces this
+            drops most rows. On CUDA no row is dropped.
     """
     return _implementation(gaussians).FrozenView(gaussians, camera, options, min_row_weight)
 
 
 def surface_points(scene: Gaussians, camera: Cameras, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:
-    """The points of the scene's surface that a picture shows at pixels x, y; those that show nothing are left out."""
+    """Find the points of the scene's surface behind pixels x, y; pixels without a surface are left out."""
     drawn = render(scene, camera, outputs=frozenset({"depth"}))
     pixels = pixels.to(drawn.depth)
     size = camera.sizes[0].to(pixels)
@@ -175,7 +181,7 @@ def surface_points(scene: Gaussians, camera: Cameras, pixels: Float[Tensor, "k 2
 
 
 def _implementation(gaussians: Gaussians) -> ModuleType:
-    # imported when first drawn: numba and gsplat take seconds to load
+    # imported on first use, because numba and gsplat take seconds to load
     name = "cuda" if gaussians.device.type == "cuda" else "cpu"
     return import_module(f"splatgraft.rendering.{name}")
 
@@ -189,7 +195,7 @@ def assemble_render(
     outputs: AbstractSet[Output],
     options: RenderOptions,
 ) -> Render:
-    """Split channels, blended over black in the order of `CHANNEL_COUNTS` and then features, into a `Render`."""
+    """Split blended channels, in the order of `CHANNEL_COUNTS` and then features, into a `Render`."""
     planes, at = {}, 0
     for name, width in CHANNEL_COUNTS.items():
         if name in outputs:

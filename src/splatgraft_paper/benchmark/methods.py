@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from splatgraft.commands.steps import consolidate, harmonize
+from splatgraft.commands.steps import harmonize
 from splatgraft.commands.steps.relight import Relight
 from splatgraft.commands.steps.render import Render
 from splatgraft.folders.composite_folder import placement_files, read_composite
@@ -19,6 +19,7 @@ from splatgraft_paper.benchmark.gain import relight_by_gain
 from splatgraft_paper.benchmark.scene import ComposedScene, perform_if_stale
 from splatgraft_paper.benchmark.transplat import relight_by_irradiance_ratio
 from splatgraft_paper.benchmark.true_light import read_true_light
+from splatgraft_paper.commands import consolidate
 from splatgraft_paper.peers.methods import method_options
 
 Prior = Literal["off", "gain", "transplat", "transfer", "true-light"]
@@ -189,9 +190,9 @@ def run_method(
     )
     if method.loss.startswith("paper"):
         loss = "l1-dssim" if method.loss == "paper-l1-dssim" else None
-        step = replace(step, method="paper", loss=loss, iterations=settings.iterations)
+        step = replace(step, loss=loss, iterations=settings.iterations)
     else:
-        step = replace(step, loss=method.loss)
+        step = replace(step, method="fast", loss=method.loss)
     if method.schedule != "once":
         step = replace(step, updates=UPDATES, schedule=method.schedule)
     seconds["consolidate"] = perform_if_stale(step, console)

@@ -4,6 +4,7 @@ _TABLE = (
     # command, module:class in splatgraft_paper.commands, summary
     ("benchmark", "benchmark:EvaluateBenchmark", "measure methods on scenes with a known truth"),
     ("exam", "exam:Exam", "measure the light transfer on new scenes drawn from a number (held-out benchmark)"),
+    ("consolidate", "consolidate:Consolidate", "the paper's consolidation: Adam on LPIPS, and iterative updates"),
     ("tables", "tables:EvaluatePaper", "write the paper's tables from the authors' data set"),
     ("synth pairs", "synth:SynthPairs", "render training pairs with Blender"),
     ("synth benchmark", "synth:SynthBenchmark", "render benchmark scenes with ground truth"),

@@ -1,7 +1,7 @@
-"""The compact network's input channels, and how its output is applied to a view.
+"""Input channels of the compact network, and the application of its output to a view.
 
-All output is gain, matrix or offset on the composite's own pixels at full resolution, so the network adds no texture
-of its own.
+The output consists of gains, colour matrices and offsets on the composite's own pixels at full resolution, so that the
+network adds no texture of its own.
 """
 
 from dataclasses import dataclass
@@ -21,9 +21,8 @@ GRID_BINS = 4
 _IMAGES = ("composite", "background", "mask", "log_ratio", "depth", "normal")
 
 
-# how views are encoded for the network: fixed by the weights that were trained with it
-_RATIO_OFFSET = 0.004
-"""Linear light added to both sides of a ratio: 1/255 of white, below which a ratio carries no information."""
+# the encoding of views for the network; the weights were trained with it
+_RATIO_OFFSET = 0.004  # linear light added to both sides of a ratio: 1/255 of white, below it a ratio is noise
 _MAX_LOG_RATIO = 3.0  # bound of the prior's log ratio, either sign
 _MAX_LOG_GAIN = 4.0  # bound of the total log gain that is applied, either sign
 _MAX_LOG_DEPTH = 2.0  # bound of the relative log depth, either sign; also the value where nothing is hit
@@ -41,16 +40,16 @@ class CompactInput:
     """Linear light, without the object."""
     mask: Float[Tensor, "b 1 h w"]
     log_ratio: Float[Tensor, "b 3 h w"]
-    """Log ratio of the prior over the composite, see `log_light_ratio`; 0 where there is no prior."""
+    """Log ratio of the prior over the composite, see `log_light_ratio`; 0 without a prior."""
     depth: Float[Tensor, "b 1 h w"]
-    """Log of depth over the object's median depth, clamped to [-2, 2]; 2 where nothing is hit."""
+    """Log of depth over the object's median depth, clamped to [-2, 2]; 2 where no surface is hit."""
     normal: Float[Tensor, "b 3 h w"]
-    """Unit, in the camera's frame (OpenCV axes); 0 where nothing is hit."""
+    """Unit normal in the camera's frame (OpenCV axes); 0 where no surface is hit."""
     prior_confidence: Float[Tensor, "b"]
     """Confidence in the prior, in [0, 1]."""
 
     def channels(self) -> Float[Tensor, "b 16 h w"]:
-        """The network's input channels."""
+        """Stack the network's input channels."""
         b, _, h, w = self.mask.shape
         prior_confidence = self.prior_confidence[:, None, None, None].expand(b, 1, h, w)
         hit = (self.normal.abs().sum(1, keepdim=True) > 0).to(self.mask)
@@ -58,7 +57,7 @@ class CompactInput:
         return torch.cat([*colors, 2 * self.mask - 1, self.depth, hit, self.normal, prior_confidence], 1)
 
     def prior(self) -> Float[Tensor, "b 3 h w"]:
-        """The view after light transfer, linear light."""
+        """Compute the view after light transfer, linear light."""
         offset = _RATIO_OFFSET
         return ((self.composite + offset) * self.log_ratio.exp() - offset).clamp_min(0)
 
@@ -89,9 +88,9 @@ class CompactOutput:
     object_grid: Float[Tensor, "b 12 l p q"]
     """Bilateral grid (Chen et al. 2007) of affine colour maps, as a difference: 3 rows of 3 factors and an offset."""
     scene_prior_scale: Float[Tensor, "b 1 i j"]
-    """The same factor as `object_prior_scale`, off the object."""
+    """Factor on the prior's log ratio off the object, as a difference from 1."""
     scene_gain: Float[Tensor, "b 3 i j"]
-    """Log gain off the object: shadow and bounce."""
+    """Log gain off the object: shadow and bounced light."""
     scene_added: Float[Tensor, "b 3 i j"]
     """Linear light added off the object: reflections."""
     log_error: Float[Tensor, "b 1 i j"]
@@ -103,13 +102,13 @@ class CompactOutput:
 
 
 def log_light_ratio(prior: Float[Tensor, "*n"], composite: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Clamped logarithm of prior over composite, both linear light with a small offset."""
+    """Compute the clamped logarithm of prior over composite, both linear light with a small offset."""
     offset, bound = _RATIO_OFFSET, _MAX_LOG_RATIO
     return ((prior + offset) / (composite + offset)).log().clamp(-bound, bound)
 
 
 def apply_output(view: CompactInput, output: CompactOutput) -> Float[Tensor, "b 3 h w"]:
-    """The view, of any size, with the output applied: linear light, at least 0. An output of zeros gives the prior."""
+    """Apply the output to a view of any size; gives linear light, at least 0. An output of zeros gives the prior."""
     size = view.mask.shape[-2:]
 
     def up(x: Tensor) -> Tensor:
@@ -145,7 +144,7 @@ def compact_input(inputs: HarmonizerInputs) -> CompactInput:
 
 
 def relative_depth(depth: Float[Tensor, "h w"], mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Log of depth over the object's median depth, clamped to [-2, 2]; 2 where nothing is hit."""
+    """Compute the log of depth over the object's median depth, clamped to [-2, 2]; 2 where no surface is hit."""
     hit, bound = depth > 0, _MAX_LOG_DEPTH
     inside = hit & (mask > 0.5)
     known = depth[inside] if bool(inside.any()) else depth[hit]
@@ -154,7 +153,7 @@ def relative_depth(depth: Float[Tensor, "h w"], mask: Float[Tensor, "h w"]) -> F
 
 
 def _log_encoded(linear: Tensor) -> Tensor:
-    """Logarithm of light, scaled to about [-1, 1]."""
+    """Compute the logarithm of light, scaled to about [-1, 1]."""
     return (linear + _LOG_OFFSET).log() / 2 + 1
 
 
@@ -165,7 +164,7 @@ def _harmonics(normal: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 9 h w"]:
 
 
 def _affine(lit: Float[Tensor, "b 3 h w"], grid: Float[Tensor, "b 12 l p q"]) -> Float[Tensor, "b 3 h w"]:
-    """Difference of colours by the bilateral grid, sliced by pixel position and brightness."""
+    """Compute the change of colours by the bilateral grid, sliced by pixel position and brightness."""
     b, _, h, w = lit.shape
     luma = lit.mean(1).clamp(0, 1) ** (1 / _LUMA_GAMMA) * 2 - 1
     y = (torch.arange(h, device=lit.device) + 0.5) / h * 2 - 1

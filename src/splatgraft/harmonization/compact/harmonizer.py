@@ -1,4 +1,4 @@
-"""The harmoniser `compact`: the network runs at a low resolution, its output is applied at full resolution."""
+"""The harmoniser `compact`: the network runs at a low resolution, and its output is applied at full resolution."""
 
 import torch
 import torch.nn.functional as F
@@ -9,14 +9,12 @@ from splatgraft.harmonization.compact.network import CompactNetwork
 from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
 
 _STRIDE = 16  # the network halves the image four times
-
-
 _LONG_SIDE = 256  # pixels of the longer side of the network's input; smaller views are not enlarged
 _HALF_CONFIDENCE_ERROR = 0.05  # sRGB; the expected error at which the confidence is one half
 
 
 class Compact:
-    """Corrects the prior by a small network, in one deterministic step."""
+    """Harmoniser that corrects the prior by a small network, in one deterministic step."""
 
     def __init__(self, network: CompactNetwork, *, device: torch.device, strength: float = 1.0) -> None:
         """Move `network` to `device`; `strength` in [0, 1] scales the correction (0 returns the prior)."""
@@ -24,7 +22,7 @@ class Compact:
 
     @torch.no_grad()
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """Correct the prior and estimate the confidence; return the prior itself where no object is visible."""
+        """Correct the prior and estimate the confidence; return the prior itself if no object is visible."""
         if float(view.mask.max()) < 0.5:
             return Harmonized(image=view.prior)
         full_size = compact_input(view).to(self._device)

@@ -1,8 +1,8 @@
 """The compact network: a U-Net of ConvNeXt blocks (Liu et al. 2022) with global attention at its coarsest level.
 
-It predicts the harmonised view from the prior in one step, which is the large model's rectified flow (paper, Sec. 5)
-at a fixed time, from the prior to the ground truth. The output heads are initialised to zero, where the result is the
-prior itself. Attribute names are the tensor names in weights files and must not change.
+It predicts the harmonised view from the prior in one step: the large model's rectified flow (paper, Sec. 5) from the
+prior to the ground truth, at a fixed time. The output heads are initialised to zero, with which the result is the prior
+itself. Attribute names are the tensor names in weights files and must not change.
 """
 
 from dataclasses import asdict, dataclass
@@ -21,13 +21,12 @@ from splatgraft.runtime.files import atomic_write
 SHIPPED = Path(__file__).parent / "compact.safetensors"
 _FORMAT = "splatgraft compact 1"
 
-
-# bounds of the outputs, either sign: fixed by the weights that were trained with them
+# bounds of the outputs, either sign; the weights were trained with them
 _MAX_LOG_GAIN = 2.0
 _MAX_PRIOR_SCALE = 1.0  # largest difference of the prior's factor from 1
 _MAX_ADDED_LIGHT = 0.25  # linear light, off the object
-_MAX_AFFINE = 0.5  # largest entry of the colour maps' differences from the identity
-_INITIAL_LOG_ERROR = -3.0  # the log of the expected error before training
+_MAX_AFFINE = 0.5  # largest difference of a colour map's entry from the identity
+_INITIAL_LOG_ERROR = -3.0  # log of the expected error before training
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class CompactSize:
 
 
 class CompactNetwork(nn.Module):
-    """Maps the channels of a view to a `CompactOutput`; the input's sides are multiples of 16."""
+    """Network from the channels of a view to a `CompactOutput`; the input's sides are multiples of 16."""
 
     def __init__(self, size: CompactSize = CompactSize()) -> None:
         """Initialise with random weights and zero output heads."""

@@ -12,10 +12,10 @@ from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
 
 
 class FluxHarmonizer:
-    """The paper's image model as a `NoisyStartHarmonizer`."""
+    """The paper's image model as a harmoniser that can also start from a partly noisy image."""
 
     def __init__(self, network: FluxNetwork, *, seed: int = 0, steps: int = 4) -> None:
-        """Use a loaded network; `seed` is that of the noise, shared by all views."""
+        """Use a loaded network; all views share the noise of `seed`."""
         self.network, self._seed, self._steps = network, seed, steps
 
     def harmonize(self, view: HarmonizerInputs) -> Harmonized:
@@ -24,10 +24,10 @@ class FluxHarmonizer:
 
     @torch.no_grad()
     def harmonize_from(self, view: HarmonizerInputs, strength: float) -> Harmonized:
-        """Harmonise one view, starting from its prior at a noise level.
+        """Harmonise one view, starting from its prior at the noise level `strength` in (0, 1].
 
-        z_t = (1 - t) z_prior + t eps with t = `strength`, then the steps from t to 0 (SDEdit, Meng et al. 2022, in
-        rectified flow). The condition is the composite at every level (paper, Iterative Dataset Update).
+        It takes z_t = (1 - t) z_prior + t eps with t = `strength`, then the steps from t to 0 (SDEdit, Meng et al.
+        2022, in rectified flow). The condition is the composite at every level (paper, Iterative Dataset Update).
         """
         if not any(math.isclose(strength, prepared, abs_tol=1e-6) for prepared in self.network.strengths):
             prepared = ", ".join(f"{level:g}" for level in self.network.strengths)

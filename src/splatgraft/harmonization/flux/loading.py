@@ -1,4 +1,4 @@
-"""Loads the FLUX harmoniser from a folder or the hub, in a precision that fits the memory of its device.
+"""Loads the FLUX harmoniser from a folder or the hub, in a precision that fits the memory of its device. Layout:
 
     transformer/config.json, diffusion_pytorch_model*.safetensors   (or these in the folder itself; also .bf16.)
     vae/  empty_prompt.safetensors  harmonizer.json                 (or beside the folder, or the base's)
@@ -20,24 +20,23 @@ from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, read_
 from splatgraft.harmonization.flux.sampling import schnell_levels
 from splatgraft.harmonization.flux.tensor_file import one_line
 from splatgraft.harmonization.interface import HarmonizerContext
-from splatgraft.harmonization.methods import FluxOptions
 from splatgraft.runtime.hub import REPOSITORIES, hub_folder, hub_id
 
 Say = Callable[[str], None]
 VARIANTS: tuple[str, ...] = get_args(Variant)
 INPUTS = 3
-"""Latents that a harmoniser's first layer takes: the noisy one, the composite's and the condition's."""
+"""Number of latents that a harmoniser's first layer takes: noisy latent, composite and condition."""
 DESCRIPTION_FILE = "harmonizer.json"
 _PREFIX = "transformer."
 BASE = REPOSITORIES["flux"]
 _AUTHORS = REPOSITORIES["dot3d"]
 _BYTES = {"bf16": 2.0, "fp8": 1.0, "offload": 0.1}
-"""Bytes of a parameter on the device, best precision first; offload holds the two blocks in use."""
-_RESERVED_BYTES = 1.2e9  # for the autoencoder, the CUDA context, kernels and fragmentation. An estimate.
+"""Bytes per parameter on the device, best precision first; offload holds the two blocks in use."""
+_RESERVED_BYTES = 1.2e9  # estimate for the autoencoder, the CUDA context, kernels and fragmentation
 
 
 def diffusers_library() -> Any:
-    """The package diffusers without its own messages: errors are reported by this package."""
+    """Import diffusers and silence its messages: this package reports errors itself."""
     import diffusers
 
     diffusers.utils.logging.set_verbosity_error()
@@ -73,9 +72,9 @@ class FluxFolder:
     folder: Path
     """The model folder."""
     transformer: Path
-    """Where the transformer's config.json is."""
+    """Folder of the transformer's config.json and weights."""
     config: dict[str, Any]
-    """The transformer's config.json."""
+    """Content of the transformer's config.json."""
 
     @staticmethod
     def open(folder: Path) -> "FluxFolder":
@@ -104,7 +103,7 @@ class FluxFolder:
         return self.config.get("num_attention_heads", 24) * self.config.get("attention_head_dim", 128)
 
     def variant(self, requested: str) -> Variant:
-        """Determine the variant: `requested`, or for `auto` that of harmonizer.json or of the folder's name."""
+        """Determine the variant: `requested`, or for `auto` the one named by harmonizer.json or by the folder."""
         if not self.is_harmonizer:
             raise ValueError(
                 f"{self.transformer}: expected a harmoniser, found FLUX itself; train one by `splatgraft paper train "
@@ -118,7 +117,7 @@ class FluxFolder:
 
 
 def declared_variant(folder: Path) -> str | None:
-    """Read the variant from harmonizer.json in `folder`; None where there is no such file."""
+    """Read the variant from harmonizer.json in `folder`; None if there is no such file."""
     path = folder / DESCRIPTION_FILE
     if not path.is_file():
         return None
@@ -165,7 +164,7 @@ def _load(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
         model, about = kind.from_pretrained(folder, torch_dtype=dtype, variant=variant, output_loading_info=True)
     except (OSError, ValueError, RuntimeError) as error:
         raise ValueError(f"{folder}: expected weights of {kind.__name__}, found {one_line(error)}") from error
-    if missing := sorted(about["missing_keys"]):  # of which diffusers only warns
+    if missing := sorted(about["missing_keys"]):  # diffusers only warns
         raise ValueError(
             f"{folder}: expected all weights of config.json, found {len(missing)} missing: {missing[0]} ..."
         )
@@ -180,7 +179,7 @@ def widen_transformer(transformer: Any, init: FirstLayer = "repeat") -> None:
 
 
 def merge_lora(transformer: Any, path: Path) -> int:
-    """Add a low-rank adaptation to the weights in place, as diffusers and PEFT load it; gives the number of layers.
+    """Add a low-rank adaptation to the weights in place, by diffusers and PEFT; gives the number of adapted layers.
 
     Parameters that the file holds whole, such as those of the widened first layer, replace the network's.
     """
@@ -209,41 +208,59 @@ def merge_lora(transformer: Any, path: Path) -> int:
     return len(layers)
 
 
-def load_flux(options: FluxOptions, context: HarmonizerContext) -> FluxNetwork:
-    """Load the network, with precomputed modulations."""
+@dataclass(frozen=True)
+class FluxFiles:
+    """The files of a FLUX harmoniser."""
+
+    weights: str
+    """Folder or hub id of the weights."""
+    base: str | None
+    """Folder or hub id of the model from which the weights were trained, for the parts that they lack."""
+    lora: Path | None
+    """A low-rank adaptation to merge into the weights."""
+    variant: str
+    """Second input of the network, or "auto" to read it from the weights' folder."""
+
+
+def load_flux(files: FluxFiles, context: HarmonizerContext, *, precision: str, sampling_steps: int) -> FluxNetwork:
+    """Load the network, with modulations precomputed for `sampling_steps` from each noise level of the context.
+
+    `precision` is a key of the storage table, "float32", or "auto" for the best that fits the free memory.
+    """
     say, device = context.say, context.device
-    weights = hub_id(str(options.weights))
-    if weights == _AUTHORS and options.variant != "auto":
-        weights = f"{_AUTHORS}/{options.variant}"
+    weights = hub_id(files.weights)
+    if weights == _AUTHORS and files.variant != "auto":
+        weights = f"{_AUTHORS}/{files.variant}"
     folder = local_folder(weights, say)
     checked = FluxFolder.open(folder)
-    if options.lora is not None and not checked.is_harmonizer:
-        found = declared_variant(options.lora.parent) if options.variant == "auto" else options.variant
-        variant = _known(found, options.lora)
+    if files.lora is not None and not checked.is_harmonizer:
+        found = declared_variant(files.lora.parent) if files.variant == "auto" else files.variant
+        variant = _known(found, files.lora)
     else:
-        variant = checked.variant(options.variant)
-    places = [folder, *([Path(options.base)] if options.base else []), folder.parent]  # or image-mask/ beside vae/
+        variant = checked.variant(files.variant)
+    # the authors' image-mask/ lies beside vae/
+    places = [folder, *([Path(files.base)] if files.base else []), folder.parent]
     prompt = read_prompt(
-        find_prompt(options.base or BASE, *places),
+        find_prompt(files.base or BASE, *places),
         tokens_width=checked.config.get("joint_attention_dim", 4096),
         pooled_width=checked.config.get("pooled_projection_dim", 768),
     )
     vae = next((place / "vae" for place in places if (place / "vae").is_dir()), None)
-    autoencoder = load_autoencoder(vae or local_folder(options.base or BASE, say, parts=()) / "vae")
-    precision, reason = options.precision, f"as requested, on {device}"
+    autoencoder = load_autoencoder(vae or local_folder(files.base or BASE, say, parts=()) / "vae")
+    reason = f"as requested, on {device}"
     if precision == "auto":
         precision, reason = _best_precision(checked, context)
     say(f"flux: {precision}, {reason}")
     dtype = torch.float32 if precision == "float32" else torch.bfloat16
     transformer = load_transformer(checked, dtype=dtype)
-    if options.lora is not None:
+    if files.lora is not None:
         if not checked.is_harmonizer:
             widen_transformer(transformer, "zero")  # as diffusers does for a low-rank first layer; ours is whole
-        say(f"lora: {merge_lora(transformer, options.lora)} layers adapted by {options.lora}")
+        say(f"lora: {merge_lora(transformer, files.lora)} layers adapted by {files.lora}")
     transformer.eval().requires_grad_(False)
     prompt = prompt.to(torch.device("cpu"), dtype)
     starts = context.strengths
-    levels = {level for start in starts for level in schnell_levels(options.sampling_steps, start=start)[:-1]}
+    levels = {level for start in starts for level in schnell_levels(sampling_steps, start=start)[:-1]}
     removed = bake(transformer, prompt, tuple(sorted(levels)))
     say(f"flux: {removed / 1e9:.2f} billion parameters of modulation replaced by a table")
     if precision == "offload":
@@ -257,12 +274,12 @@ def load_flux(options: FluxOptions, context: HarmonizerContext) -> FluxNetwork:
 
 
 def _best_precision(checked: FluxFolder, context: HarmonizerContext) -> tuple[str, str]:
-    """The best precision that fits the free memory of the device, and why it is taken."""
+    """Choose the best precision that fits the free memory of the device; gives it and the reason."""
     if context.device.type != "cuda":
         return "float32", f"on {context.device}; minutes per view at FLUX's size"
     doubles, singles = checked.config.get("num_layers", 19), checked.config.get("num_single_layers", 38)
     return choose_precision(
-        # without modulation: 12 width^2 per single block and per stream of a double block
+        # without the modulation layers: 12 width^2 per single block and per stream of a double block
         parameters=checked.width**2 * (24 * doubles + 12 * singles),
         working=working_bytes(pixels=context.pixels, width=checked.width),
         free=torch.cuda.mem_get_info(context.device)[0],
@@ -270,13 +287,13 @@ def _best_precision(checked: FluxFolder, context: HarmonizerContext) -> tuple[st
 
 
 def working_bytes(*, pixels: int, width: int) -> int:
-    """Estimate the largest activations of one pass: a token covers 256 pixels of a view, and text adds 512 tokens."""
+    """Estimate the bytes of the largest activations: a token covers 256 pixels of a view, and text adds 512 tokens."""
     tokens = (pixels // 256 + 512) * width * 2 * 40  # about 40 bf16 copies of the transformer's tokens
     return max(tokens, pixels * 256 * 2 * 3)  # the decoder has three copies of 256 channels at full size
 
 
 def choose_precision(*, parameters: int, working: int, free: int) -> tuple[str, str]:
-    """The best precision of the transformer that fits with `working` bytes of activations into `free` ones, and why."""
+    """Choose the best precision with which `parameters` and `working` bytes of activations fit into `free` bytes."""
     need = 0.0
     for precision, each in _BYTES.items():
         need = parameters * each + working + _RESERVED_BYTES

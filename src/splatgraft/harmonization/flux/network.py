@@ -1,4 +1,4 @@
-"""The parts of the FLUX harmoniser and the calls into them: autoencoder, transformer, layout of the latents."""
+"""The parts of the FLUX harmoniser and calls into them: autoencoder, transformer, layout of the latents."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from splatgraft.harmonization.flux.prompt import PromptEmbedding
 
 Variant = Literal["image-mask", "image-background"]
-"""The second condition beside the composite: the object's mask, or the scene without the object."""
+"""Second condition beside the composite: the object's mask, or the scene without the object."""
 FirstLayer = Literal["repeat", "zero"]
 MULTIPLE = 16
-"""Image sides are multiples of this, pixels: 8 for the autoencoder times 2 for the packing (paper, Sec. 5.3)."""
+"""Factor of the image's sides, pixels: 8 for the autoencoder times 2 for the packing (paper, Sec. 5.3)."""
 Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)
 
 
@@ -32,7 +32,7 @@ class Autoencoder:
 
     @torch.no_grad()
     def encode(self, images: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c i j"]:
-        """Encode sRGB images in [0, 1] to latents of an eighth of the size; the mean of the posterior, not a sample."""
+        """Encode sRGB images in [0, 1] to latents of an eighth of the size: the mean of the posterior, not a sample."""
         weight = next(self.network.parameters())
         mean = self.network.encode((images * 2 - 1).to(weight)).latent_dist.mode().float()
         return (mean - self._shift) * self.network.config.scaling_factor
@@ -62,7 +62,7 @@ class FluxNetwork:
     dtype: torch.dtype
     """Number type of the transformer's arithmetic."""
     strengths: tuple[float, ...] = (1.0,)
-    """Noise levels to start from that its modulations are precomputed for."""
+    """Noise levels of a start for which the modulations are precomputed."""
 
 
 def velocity(
@@ -107,7 +107,7 @@ def unpack(tokens: Float[Tensor, "b n d"], height: int, width: int) -> Float[Ten
 
 
 def positions(height: int, width: int, device: torch.device) -> Float[Tensor, "n 3"]:
-    """Position of each token of latents of `height` x `width`: 0 (the text coordinate), row, column."""
+    """Compute the position of each token of latents of `height` x `width`: 0 (the text coordinate), row, column."""
     rows, columns = torch.arange(height // 2, device=device), torch.arange(width // 2, device=device)
     row, column = torch.meshgrid(rows, columns, indexing="ij")
     return torch.stack([torch.zeros_like(row), row, column], -1).reshape(-1, 3).float()
@@ -121,16 +121,16 @@ def pad_by_reflection(images: Float[Tensor, "b c h w"], multiple: int = MULTIPLE
 
 
 def _reflected_indices(size: int, length: int) -> Tensor:
-    """Indices 0, 1, .., size-1, size-2, .., 0, 1, .. of that length."""
+    """Compute the indices 0, 1, .., size-1, size-2, .., 0, 1, .. up to `length` of them."""
     period = max(2 * size - 2, 1)
     index = torch.arange(length) % period
     return torch.where(index < size, index, period - index)
 
 
 def widen_layer(layer: Layer, times: int, init: FirstLayer = "repeat") -> Layer:
-    """Make a layer for `times` as many input channels, with the same bias and the same weights for the first input.
+    """Widen a layer to `times` its input channels; the bias and the weights of the first input stay.
 
-    For the further inputs `repeat` copies the weights (the paper, after DEGS); `zero` sets them to 0, so that the
+    `repeat` copies the weights to the further inputs (the paper, after DEGS). `zero` sets those to 0, so that the
     widened network ignores its conditions at first (diffusers' control training).
     """
     weight = layer.weight.detach()

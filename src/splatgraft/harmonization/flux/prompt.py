@@ -1,4 +1,4 @@
-"""The empty prompt's text embeddings, read from a file so that no text encoder is loaded."""
+"""Text embeddings of the empty prompt, read from a file so that no text encoder is loaded."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,14 +28,14 @@ class PromptEmbedding:
 
 
 def prompt_file(base: str) -> Path:
-    """Where `train embed` writes the embeddings of a base: in its folder, or for a hub id in the user's cache."""
+    """Return the file for the embeddings of a base: in its folder, or for a hub id in the user's cache."""
     if Path(base).is_dir():
         return Path(base) / PROMPT_FILE
     return Path.home() / ".cache" / "splatgraft" / "prompts" / hub_id(base).replace("/", "--") / PROMPT_FILE
 
 
 def find_prompt(base: str, *folders: Path) -> Path:
-    """The embeddings in the first of `folders` that has them, else where `train embed` writes those of `base`."""
+    """Find the embeddings in the first of `folders` that has them, else in the file of `base` (`prompt_file`)."""
     return next((folder / PROMPT_FILE for folder in folders if (folder / PROMPT_FILE).is_file()), prompt_file(base))
 
 

@@ -8,11 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 Velocity = Callable[[Tensor, float], Tensor]
-"""The velocity at noisy latents and a noise level in [0, 1]."""
+"""Function from noisy latents and a noise level in [0, 1] to the velocity."""
 
 
 def schnell_levels(steps: int = 4, *, start: float = 1.0) -> tuple[float, ...]:
-    """Noise levels from `start` to 0 in `steps` equal steps: from 1, FLUX.1-schnell's schedule, not shifted.
+    """Compute noise levels from `start` to 0 in `steps` equal steps; from 1: FLUX.1-schnell's schedule, not shifted.
 
     The number of steps does not depend on `start`: the paper's updates take the same time with both its schedules
     (Table Iterative Dataset Update), though their levels differ.
@@ -25,14 +25,14 @@ def schnell_levels(steps: int = 4, *, start: float = 1.0) -> tuple[float, ...]:
 
 
 def noise(size: tuple[int, int, int], seed: int) -> Float[Tensor, "c h w"]:
-    """Standard normal latents drawn on the CPU: independent of device and batch size."""
+    """Draw standard normal latents on the CPU, so that they do not depend on device and batch size."""
     return torch.randn(size, generator=torch.Generator().manual_seed(seed))
 
 
 def noisy(
     clean: Float[Tensor, "b c h w"], noise: Float[Tensor, "b c h w"], level: Float[Tensor, " b"]
 ) -> Float[Tensor, "b c h w"]:
-    """Noisy latents z_t = (1 - t) z_0 + t eps (paper, Sec. 5)."""
+    """Compute noisy latents z_t = (1 - t) z_0 + t eps (paper, Sec. 5)."""
     t = level[:, None, None, None]
     return (1 - t) * clean + t * noise
 

@@ -21,7 +21,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, str] | None = None) -> None:
     """Write a .safetensors file atomically; `about` goes into its metadata, as JSON."""
-    # one key: safetensors writes several in an order that differs from run to run
+    # one key, because safetensors writes several keys in an order that differs from run to run
     metadata = {"splatgraft": json.dumps(dict(about), sort_keys=True)} if about else None
     content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}, metadata)
     with atomic_write(path) as stream:
@@ -29,5 +29,5 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str,
 
 
 def one_line(error: Exception) -> str:
-    """Type and message of an error in one line; the message is cut at 200 characters."""
+    """Format type and message of an error in one line; the message is cut at 200 characters."""
     return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"

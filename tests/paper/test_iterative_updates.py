@@ -1,4 +1,4 @@
-"""Updates of `consolidate`: views are harmonised again from renders of the scene so far, with decreasing noise."""
+"""`paper consolidate`: the paper's descent, and updates of the views from renders of the scene so far."""
 
 from dataclasses import replace
 
@@ -10,7 +10,6 @@ pytest.importorskip("diffusers")
 from random_lpips import write_random_lpips
 from tiny_models import CHANNELS, flux_folder, quiet
 
-from splatgraft.commands.steps.consolidate import Consolidate
 from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.folders.view_folder import ViewFolder
@@ -20,6 +19,7 @@ from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer
 from splatgraft.project.step import perform
 from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
+from splatgraft_paper.commands.consolidate import Consolidate
 
 pytestmark = list(quiet)
 
@@ -44,7 +44,7 @@ def test_every_update_begins_at_the_noise_of_the_schedule_on_renders_of_the_scen
         return original(self, view, strength)
 
     monkeypatch.setattr(FluxHarmonizer, "harmonize_from", watched)
-    options = {"method": "paper", "loss": "l1-dssim", "iterations": 20}
+    options = {"loss": "l1-dssim", "iterations": 20}
     once = perform(consolidation(finished_project, harmonized, tmp_path / "once", **options), Console())
     step = consolidation(
         finished_project, harmonized, tmp_path / "thrice", updates=3, schedule="geometric", **options
@@ -66,8 +66,10 @@ def test_every_update_begins_at_the_noise_of_the_schedule_on_renders_of_the_scen
 def test_a_method_without_noise_begins_at_renders_too_and_says_so(finished_project, tmp_path, capsys):
     harmonized = tmp_path / "harmonized"
     perform(Harmonize(finished_project / "views", harmonized, NoneOptions(), device="cpu"), Console())
-    perform(consolidation(finished_project, harmonized, tmp_path / "out", updates=2, passes=1), Console())
-    assert "none: no noise levels; each of 2 updates begins at renders of the scene" in capsys.readouterr().err
+    perform(
+        consolidation(finished_project, harmonized, tmp_path / "out", method="fast", updates=2, passes=1), Console()
+    )
+    assert "none: no noise; each of 2 updates begins at renders of the scene so far" in capsys.readouterr().err
 
 
 def test_views_of_an_unknown_method_cannot_be_updated(finished_project, tmp_path):
@@ -78,12 +80,12 @@ def test_views_of_an_unknown_method_cannot_be_updated(finished_project, tmp_path
         perform(replace(step, images=finished_project / "harmonized", updates=0), Console())
 
 
-def test_the_method_paper_minimises_lpips_alone(finished_project, tmp_path):
+def test_the_default_minimises_lpips_alone(finished_project, tmp_path):
     write_random_lpips(tmp_path)
-    step = consolidation(finished_project, tmp_path, tmp_path / "out", method="paper", lpips_weights=tmp_path)
+    step = consolidation(finished_project, tmp_path, tmp_path / "out", lpips_weights=tmp_path)
     generator = torch.Generator().manual_seed(0)
     pair = [torch.rand(32, 32, 3, generator=generator) for _ in range(2)]
-    loss = step._options().image_loss
+    loss = step.image_loss()
     assert torch.equal(loss(*pair), lpips_vgg(tmp_path)(*pair))
     # section 6: 10,000 steps
-    assert step._options().iterations == 10_000
+    assert step.iterations == 10_000
