@@ -15,13 +15,11 @@ from splatgraft.rendering import render
 UP = torch.tensor([0.0, 0.0, 1.0])
 
 
-def loss(inverse: torch.Tensor, image: torch.Tensor, *, spread: float = 0.0, bend: float = 1.0, unit: float = 1.0):
+def loss(inverse: torch.Tensor, image: torch.Tensor, *, unit: float = 1.0):
     """Return the loss of opaque pixels with one depth each, mean over many draws."""
-    moments = torch.stack([inverse, inverse.square()], -1)
-    rule = SurfaceLoss(unit=unit, spread=spread, bend=bend)
-    alpha = torch.ones_like(inverse)
+    moments, alpha = torch.stack([inverse, inverse.square()], -1), torch.ones_like(inverse)
     draws = [torch.Generator().manual_seed(i) for i in range(64)]
-    return torch.stack([rule.loss(moments, alpha, image, done=1.0, generator=one) for one in draws]).mean()
+    return torch.stack([SurfaceLoss(unit).loss(moments, alpha, image, generator=one) for one in draws]).mean()
 
 
 def sheet(slope_x: float, slope_y: float, offset: float = 1.0) -> torch.Tensor:
@@ -41,28 +39,10 @@ def test_a_plane_costs_nothing_and_a_step_only_where_the_photograph_has_no_edge(
     assert loss(halves, painted) < 1e-6
 
 
-def test_one_depth_has_no_spread_and_two_have():
-    plain = torch.full((48, 64, 3), 0.5)
-    near, far = sheet(0.2, 0.1), sheet(0.2, 0.1, 0.7)
-    alone = SurfaceLoss(unit=1.0, spread=1.0, bend=0.0)
-    generator = torch.Generator().manual_seed(0)
-    one = torch.stack([near, near.square()], -1)
-    both = torch.stack([0.5 * (near + far), 0.5 * (near.square() + far.square())], -1)
-    alpha = torch.ones_like(near)
-    # float32: a difference of squares of about 1
-    assert abs(float(alone.loss(one, alpha, plain, done=1.0, generator=generator))) < 1e-6
-    # the variance of two values .3 apart is .15 squared
-    expected = torch.tensor(0.15**2).log1p()
-    assert float(alone.loss(both, alpha, plain, done=1.0, generator=generator)) == pytest.approx(
-        float(expected), rel=1e-4
-    )
-    assert float(alone.loss(both, alpha, plain, done=0.0, generator=generator)) == 0
-
-
 def test_the_unit_of_the_world_does_not_matter():
     curved = 1 / (2 + sheet(0.2, 0.3).square())
     plain = torch.full((48, 64, 3), 0.5)
-    metres, feet = loss(curved, plain, spread=3.0, unit=2.0), loss(curved / 3.28, plain, spread=3.0, unit=2.0 * 3.28)
+    metres, feet = loss(curved, plain, unit=2.0), loss(curved / 3.28, plain, unit=2.0 * 3.28)
     # the same numbers up to rounding
     assert float(metres) == pytest.approx(float(feet), rel=1e-4)
 

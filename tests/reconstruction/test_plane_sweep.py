@@ -43,6 +43,26 @@ def test_points_lie_on_the_surface_that_the_views_show():
     assert (found.colors - truth).abs().median() < 0.1
 
 
+def test_plain_ground_between_known_points_is_found_at_their_plane():
+    cameras, _ = views_of_a_floor()
+    plain = [torch.full((64, 96, 3), 0.4) for _ in cameras]
+    axis = torch.linspace(-4, 4, 6)
+    known = torch.cat([torch.cartesian_prod(axis, axis), torch.zeros(36, 1)], 1)
+    found = sweep(cameras, plain, known=known, reach=DISTANCE)
+    # inverse depth is linear on a plane, so only float32 remains; without the known points, which reach to 4, the
+    # farthest of all depths is taken
+    on_floor = found.points[:, 2].abs() < 1e-3
+    assert int(on_floor.sum()) > 0.9 * len(found) > 500
+
+
+def test_points_that_one_view_alone_shows_are_left_out():
+    cameras, images = views_of_a_floor()
+    images[0] = images[0].roll(24, dims=1)
+    found = sweep(cameras, images, known=torch.zeros(0, 3), reach=DISTANCE)
+    # within 5% of the floor's depth, plus the step between two hypotheses
+    assert float((found.points[:, 2].abs() < 0.8).float().mean()) > 0.95
+
+
 def test_rays_with_a_known_point_are_left_alone():
     cameras, images = views_of_a_floor()
     axis = torch.linspace(-8, 8, 200)

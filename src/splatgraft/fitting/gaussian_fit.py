@@ -305,7 +305,7 @@ def _stepped(state: FitState, views: Views, options: FitOptions) -> tuple[FitSta
     loss = l1_dssim(picture, target)
     if options.surfaces is not None:
         drawing, photo = _generator(options.seed, state.iteration, plus=2), target.detach()
-        loss = loss + options.surfaces.loss(drawn.inverse_depth[0], drawn.alpha[0], photo, done=done, generator=drawing)
+        loss = loss + options.surfaces.loss(drawn.inverse_depth[0], drawn.alpha[0], photo, generator=drawing)
     value = float(loss.detach())
     if not math.isfinite(value):
         raise _diverged(state, f"a loss of {value}")

@@ -1,13 +1,8 @@
-"""Losses on inverse depth that put Gaussians onto surfaces, beside the photometric loss of a fit.
+"""Loss on inverse depth that holds plain surfaces, beside the photometric loss of a fit.
 
-Photographs alone leave depth open: faint Gaussians in front of others, or a plain surface at any depth, give the same
-pictures. Two terms, both on the moments of inverse depth along each ray that `render` blends:
-
-1. Spread: the variance of inverse depth along a ray, because a ray should meet one thin surface. It is the distortion
-   of Mip-NeRF 360 (Barron et al. 2022) and 2DGS (Huang et al. 2024) in closed form; its logarithm bounds the pull of a
-   Gaussian just in front of a camera.
-2. Bend: the second difference of inverse depth over plain parts of a photograph. Inverse depth is linear in the pixel
-   on a plane, so that a bare table is held by its textured rim (the planar prior of ACMP, Xu and Tao 2020, as a loss).
+Photographs alone leave the depth of a plain surface open: at any depth it gives the same pictures. Inverse depth is
+linear in the pixel on a plane. So the loss is the second difference of the mean inverse depth of rays over plain parts of a
+photograph, and a bare table is held by its textured rim. It is the planar prior of ACMP (Xu and Tao 2020) as a loss.
 """
 
 from dataclasses import dataclass
@@ -16,25 +11,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_FAINT = 1e-3  # opacity that a ray's moments are divided by at least
+_FAINT = 1e-3  # smallest opacity by which a ray's moment is divided
 _SOLID = 0.5  # opacity below which a pixel shows no surface
 _EDGE = (
-    0.04  # difference over two pixels, sRGB, from which a photograph is not plain: twice the noise of a phone's photo
+    0.04  # difference over two pixels, sRGB, above which a photograph is not plain; twice the noise of a phone's photo
 )
 
 
 @dataclass(frozen=True)
 class SurfaceLoss:
-    """Weights of both terms, and when they act; chosen with benchmarks/fit_surfaces.py."""
+    """Weight and unit of the loss; the weight was chosen with benchmarks/fit_surfaces.py."""
 
     unit: float
-    """Length in which depth is measured, world units: the distance of what the cameras look at."""
-    spread: float = 0.3
-    """Factor on the spread."""
-    bend: float = 0.3
-    """Factor on the bend."""
-    spread_from: float = 0.5
-    """Share of the steps after which the spread counts. Earlier it holds what is far at the nearest surface's edge."""
+    """Length in which depth is measured, world units: distance of the cameras from their focus point."""
+    weight: float = 1.0
+    """Factor on the loss."""
 
     def loss(
         self,
@@ -42,25 +33,18 @@ class SurfaceLoss:
         alpha: Float[Tensor, "h w"],
         image: Float[Tensor, "h w 3"],
         *,
-        done: float,
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
-        """Sum of both terms, means over pixels; differentiable in `inverse_depth` and `alpha`.
+        """Compute the loss, a mean over pixels; differentiable in `inverse_depth` and `alpha`.
 
         Args:
-            inverse_depth: Moments as `render` gives them, per world unit and its square.
+            inverse_depth: Moments from `render`, per world unit and its square; only the first is used.
             alpha: Opacity of the pixels.
-            image: The photograph, sRGB, which says where the surface is plain.
-            done: Share of the steps that are done, in [0, 1].
+            image: The photograph, sRGB; its edges separate surfaces.
             generator: Draws the axis and the distance of the second difference.
         """
-        first, second = inverse_depth.unbind(-1)
-        mean = first / alpha.clamp_min(_FAINT)
-        bend = self.bend * _bend(self.unit * mean, alpha, image, generator)
-        if done < self.spread_from:
-            return bend
-        variance = self.unit**2 * (second - first * mean)
-        return bend + self.spread * variance.clamp_min(0).log1p().mean()
+        mean = self.unit * inverse_depth[..., 0] / alpha.clamp_min(_FAINT)
+        return self.weight * _bend(mean, alpha, image, generator)
 
 
 def _bend(
@@ -69,10 +53,10 @@ def _bend(
     image: Float[Tensor, "h w 3"],
     generator: torch.Generator,
 ) -> Float[Tensor, ""]:
-    """Mean absolute second difference between three pixels in a row or column, with no edge of the image between them.
+    """Compute the mean absolute second difference of three pixels in a row or column without an edge between them.
 
-    Their distance is drawn between 2 pixels and half of the side, evenly in its logarithm: small ones smooth, large
-    ones carry the depth of a rim over the whole of a bare surface.
+    Their distance is drawn between 2 pixels and half of the side, evenly in its logarithm. Small distances smooth;
+    large ones carry the depth of a rim over the whole of a bare surface.
     """
     upright, share = torch.rand(2, generator=generator).tolist()
     if upright < 0.5:

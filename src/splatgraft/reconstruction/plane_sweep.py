@@ -1,15 +1,22 @@
-"""Plane sweep over small images: rough surface points as seeds for a reconstruction with few sparse points.
+"""Plane sweep over small images: rough surface points as seeds where structure from motion found none.
 
-Each view has a grid of pixels. Along the ray of each pixel, the depth is chosen at which a patch parallel to the image
-agrees best with the nearest views (Collins 1996). The cost of a patch is the mean absolute difference of its pixels.
-The mean over the better half of the views allows for occlusion (Kang et al. 2001).
+Each view has a grid of cells. A cell without a sparse point gets a ray:
+
+1. Along the ray, the depth is chosen at which a patch parallel to the image agrees best with the nearest views (Collins
+   1996). The cost of a patch is the mean absolute difference of its pixels. The mean over the better half of the views
+   allows for occlusion (Kang et al. 2001).
+2. Plain surfaces agree at many depths. The depth between the sparse points around the cell, linear over their Delaunay
+   triangles, is taken unless another one agrees clearly better (planar prior of ACMP, Xu and Tao 2020).
+3. A point stays if two of the compared views have a point of the same depth there.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
+from scipy.interpolate import LinearNDInterpolator
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
@@ -25,7 +32,9 @@ NEAR, _FAR = 0.4, 8.0
 """Depth range, over the cameras' mean distance from their focus point."""
 _MIN_KNOWN = 100  # fewest known points that may raise the nearest depth
 _KNOWN_QUANTILE = 0.02  # share of the known points nearer than that depth; structure from motion has some outliers
-_TIE = 0.015  # insignificant difference in cost, four grey levels
+_TIE = 0.015  # insignificant difference in cost, four grey levels; twice as much overrules the prior
+_AGREEING_VIEWS = 2  # compared views that confirm a point
+_SAME_DEPTH = 0.05  # largest relative difference of depth between views that agree
 _MAX_COST = 0.12  # largest mean absolute difference, sRGB, at which a ray gives a point
 
 
@@ -47,16 +56,87 @@ def sweep(
     if len(known) >= _MIN_KNOWN:
         nearest = max(nearest, float(_nearest(known, cameras).quantile(_KNOWN_QUANTILE)))
     depths = 1 / torch.linspace(1 / (_FAR * reach), 1 / nearest, _DEPTHS)
-    found = SeedPoints.none()
+    compared = [_compared_views(view, cameras, reach) for view in range(len(cameras))]
+    candidates: list[SeedPoints] = []
     for view, camera in enumerate(cameras):
-        rows, columns = (torch.arange(_CELL_PX // 2, n, _CELL_PX) for n in (camera.height, camera.width))
-        y, x = (grid.flatten() for grid in torch.meshgrid(rows, columns, indexing="ij"))
-        free = ~_occupied(known, camera, (len(columns), len(rows)))
-        centers = torch.stack([x[free], y[free]], -1).float() + 0.5
-        others = _compared_views(view, cameras, reach)
-        if len(centers) and others:
-            found = found.joined(_points_of_view(view, centers, others, cameras=cameras, images=images, depths=depths))
+        cells = _Cells.of(known, camera)
+        free = (cells.nearest < 0).nonzero().flip(-1)
+        centers = _CELL_PX * free.float() + _CELL_PX / 2 + 0.5
+        if not len(centers) or not compared[view]:
+            candidates.append(SeedPoints.none())
+            continue
+        hypotheses = torch.cat([depths[:, None].expand(-1, len(centers)), cells.interpolated_depth(centers)[None]])
+        candidates.append(
+            _points_of_view(view, centers, compared[view], cameras=cameras, images=images, depths=hypotheses)
+        )
+    surfaces = [
+        _Cells.of(torch.cat([known, points.points]), camera).depth_map()
+        for points, camera in zip(candidates, cameras, strict=True)
+    ]
+    found = SeedPoints.none()
+    for points, others in zip(candidates, compared, strict=True):
+        votes = sum((_agrees(points.points, cameras[j], surfaces[j]) for j in others), torch.zeros(len(points)))
+        found = found.joined(points.select(votes >= _AGREEING_VIEWS))
     return found
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Points in the cells of one image."""
+
+    pixels: Float[Tensor, "m 2"]
+    """Places of the points, pixels."""
+    depths: Float[Tensor, "m"]
+    """Depths of the points."""
+    nearest: Int[Tensor, "rows columns"]
+    """Index of the nearest point of each cell; -1 without one."""
+
+    @staticmethod
+    def of(points: Float[Tensor, "m 3"], camera: Cameras) -> "_Cells":
+        """Sort points into the cells of an image."""
+        columns, rows = (len(range(_CELL_PX // 2, n, _CELL_PX)) for n in (camera.width, camera.height))
+        pixels, depths = _project(points, camera)
+        place = (pixels / _CELL_PX).floor().long()
+        inside = (depths > 0) & (place >= 0).all(1) & (place[:, 0] < columns) & (place[:, 1] < rows)
+        # written from far to near, so the nearest stays
+        far_to_near = depths.argsort(descending=True)
+        far_to_near = far_to_near[inside[far_to_near]]
+        nearest = torch.full((rows, columns), -1).numpy()
+        nearest[place[far_to_near, 1].numpy(), place[far_to_near, 0].numpy()] = far_to_near.numpy()
+        return _Cells(pixels, depths, torch.from_numpy(nearest))
+
+    def depth_map(self) -> Float[Tensor, "rows columns"]:
+        """Return the depth of the nearest point of each cell; infinite without one."""
+        return (
+            torch.where(self.nearest >= 0, self.depths[self.nearest], torch.inf)
+            if len(self.depths)
+            else (torch.full(self.nearest.shape, torch.inf))
+        )
+
+    def interpolated_depth(self, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, "k"]:
+        """Interpolate inverse depth over the Delaunay triangles of the nearest points; infinite outside of them."""
+        corners = self.nearest[self.nearest >= 0]
+        if len(corners) < 4:  # fewest that surely have a triangle in Qhull
+            return torch.full((len(pixels),), torch.inf)
+        inverse = LinearNDInterpolator(self.pixels[corners].numpy(), 1 / self.depths[corners].numpy(), fill_value=0)
+        return 1 / torch.from_numpy(inverse(pixels.numpy())).float()
+
+
+def _agrees(
+    points: Float[Tensor, "m 3"], camera: Cameras, surface: Float[Tensor, "rows columns"]
+) -> Float[Tensor, "m"]:
+    """Return 1 for points with the depth of `surface` in their cell or a neighbouring one, else 0."""
+    pixels, depths = _project(points, camera)
+    rows, columns = surface.shape
+    # one more cell on each side, so that points out of view find no surface
+    padded = torch.nn.functional.pad(surface, (2, 2, 2, 2), value=torch.inf)
+    place = (pixels / _CELL_PX).floor().nan_to_num(-2).clamp(-1, max(rows, columns)).long() + 2
+    x, y = place[:, 0].clamp_max(columns + 2), place[:, 1].clamp_max(rows + 2)
+    same = torch.zeros(len(points), dtype=torch.bool)
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            same |= (depths / padded[y + dy, x + dx] - 1).abs() < _SAME_DEPTH
+    return (same & (depths > 0)).float()
 
 
 def _points_of_view(
@@ -66,23 +146,29 @@ def _points_of_view(
     *,
     cameras: Sequence[Cameras],
     images: Sequence[Tensor],
-    depths: Float[Tensor, "d"],
+    depths: Float[Tensor, "d m"],
 ) -> SeedPoints:
-    """Find points on the rays through `centers` of one view by comparing it with others; `depths` end nearest."""
-    camera = cameras[view]
+    """Find points on the rays through `centers` of one view by comparing it with others.
+
+    `depths` fall along each ray; the last one is the prior, which may be infinite.
+    """
+    camera, ray = cameras[view], torch.arange(len(centers))
     step = _PATCH_SPACING_PX * torch.tensor([-1.0, 0.0, 1.0])
     dy, dx = (grid.flatten() for grid in torch.meshgrid(step, step, indexing="ij"))
     pixels = centers[:, None] + torch.stack([dx, dy], -1)
     own = _sampled(images[view], pixels)
-    patches = camera.centers[0].float() + depths[:, None, None, None] * _rays(camera, pixels)
+    has_prior = depths[-1].isfinite()
+    depths = torch.cat([depths[:-1], torch.where(has_prior, depths[-1], depths[0])[None]])
+    patches = camera.centers[0].float() + depths[:, :, None, None] * _rays(camera, pixels)
     costs = torch.stack([_cost(patches, own, cameras[j], images[j]) for j in others])
     costs = costs.sort(0).values[: (len(others) + 1) // 2].mean(0)
     best = costs.min(0).values
     # among depths of equal cost, the farthest hides no surface of another view
     index = (costs <= best + _TIE).int().argmax(0)
-    points = patches[index, torch.arange(len(centers)), patches.shape[2] // 2]
-    good = (best < _MAX_COST) & (_nearest(points, cameras) > depths[-1])
-    spacing = _CELL_PX * depths[index] / camera.intrinsics[0, 0, 0].float()
+    index = torch.where(has_prior & (costs[-1] <= best + 2 * _TIE), len(depths) - 1, index)
+    chosen, points = depths[index, ray], patches[index, ray, patches.shape[2] // 2]
+    good = (best < _MAX_COST) & (_nearest(points, cameras) > depths[-2])
+    spacing = _CELL_PX * chosen / camera.intrinsics[0, 0, 0].float()
     return SeedPoints(points[good], own[good].mean(1), spacing[good])
 
 
@@ -140,14 +226,3 @@ def _cost(
     inside = (middle >= 0).all(-1) & (middle < torch.tensor([camera.width, camera.height])).all(-1)
     inside &= depth[:, :, depth.shape[2] // 2] > 0
     return torch.where(inside, difference, 1.0)
-
-
-def _occupied(points: Tensor, camera: Cameras, cells: tuple[int, int]) -> Bool[Tensor, "c"]:
-    """Test which of columns x rows cells of an image hold a point."""
-    columns, rows = cells
-    out = torch.zeros(rows * columns, dtype=torch.bool)
-    pixels, depth = _project(points, camera)
-    place = (pixels / _CELL_PX).floor().long()
-    inside = (depth > 0) & (place >= 0).all(1) & (place[:, 0] < columns) & (place[:, 1] < rows)
-    out[place[inside, 1] * columns + place[inside, 0]] = True
-    return out

@@ -36,7 +36,6 @@ from splatgraft.reconstruction.plane_sweep import sweep
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
 _PUBLISHED_ITERATIONS = 30_000  # steps for which the published values hold (3DGS)
-_MANY_POINTS = 1000  # sparse points below which a plane sweep adds more
 _MIN_POINTS = 100  # sparse and swept points below which random ones replace them
 _SMALL_SIDE_PX = 160  # longest side of the images of the plane sweep and of the far shell's colours
 _SHELL_SHARE = 0.05  # Gaussians of the far shell over the budget; set by hand
@@ -62,8 +61,7 @@ def reconstruct(
     """Fit Gaussians to a capture (3D Gaussian Splatting, Kerbl et al. 2023; density control after Taming 3DGS).
 
     Args:
-        capture: Posed images; Gaussians start at the sparse points if there are at least 1000 of these, else also at
-            points of a plane sweep.
+        capture: Posed images; Gaussians start at the sparse points, and at points of a plane sweep between them.
         options: Length, size, resolution and seed.
         progress: Called with steps done, steps in all and a short text.
         checkpoint: Storage of the state; a stopped run continues from it.
@@ -123,22 +121,21 @@ def _start(
     far_shell: bool,
     progress: Progress,
 ) -> Gaussians:
-    """Make Gaussians at sparse points, swept points if these are few, random ones if still few, and the far shell."""
+    """Make Gaussians at sparse and swept points, at random ones if these are few, and the far shell."""
     focus, reach = looked_at(capture.cameras)
     budget = options.max_gaussians
     seeds = SeedPoints(
         capture.points.float(), capture.point_colors.float(), torch.full((len(capture.points),), torch.inf)
     )
-    if len(seeds) < _MANY_POINTS:
-        swept = sweep(*small, known=seeds.points, reach=reach)
-        found = f"{len(seeds) or 'no'} sparse points"
-        seeds = seeds.joined(swept)
-        if len(seeds) < _MIN_POINTS:
-            seeds = random_seeds(capture.cameras, count=max(budget // 4, 1), seed=options.seed)
-            found = f"{found}: starting from {len(seeds)} random ones in the volume that most cameras see"
-        else:
-            found = f"{found}: {len(swept)} more found by comparing views"
-        progress(0, options.all_iterations, found)
+    swept = sweep(*small, known=seeds.points, reach=reach)
+    found = f"{len(seeds) or 'no'} sparse points"
+    seeds = seeds.joined(swept)
+    if len(seeds) < _MIN_POINTS:
+        seeds = random_seeds(capture.cameras, count=max(budget // 4, 1), seed=options.seed)
+        found = f"{found}: starting from {len(seeds)} random ones where the cameras look"
+    else:
+        found = f"{found}, {len(swept)} more by comparing views"
+    progress(0, options.all_iterations, found)
     shell = SeedPoints.none()
     if far_shell:
         radius = shell_radius(capture.points, focus, reach)
