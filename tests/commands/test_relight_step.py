@@ -80,8 +80,8 @@ def test_the_lights_of_both_places_are_drawn_past_an_object_without_gaussians(tm
     objects = {"nothing.ply": (nothing, [at(0, 0)]), "own.ply": (ball(), [at(0, 0)])}
     found = relit(tmp_path, (room(0.8), room(0.25)), objects)
     drawn = {path.name: read_rgb(path) for path in found.glob("*.png")}
-    # numbers of the placement's objects, as in the report
-    assert "Where object 2 comes from" in (found / "light.txt").read_text()
+    # numbered as the placement's objects, as in the report
+    assert "At the old place of object 2" in (found / "light.txt").read_text()
     assert sorted(drawn) == ["light.png", "source_light_2.png"]
     assert {picture.shape for picture in drawn.values()} == {(256, 768, 3)}
     assert float(drawn["light.png"].mean()) > float(drawn["source_light_2.png"].mean()) + 0.05

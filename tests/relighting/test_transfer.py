@@ -365,7 +365,7 @@ def test_most_of_a_light_that_hardly_any_photo_shows_is_said_to_be_a_guess():
     assert "a guess (20%" in note.remedy
     assert "20% of the surroundings were photographed, as given." in note.text
     assert unknown.in_doubt
-    assert unknown.text == "The light that object 1 had is not known: it keeps its mean brightness."
+    assert unknown.text == "The old light of object 1 is unknown: the object keeps its mean brightness."
 
 
 def test_one_source_per_object_is_required():

@@ -146,7 +146,7 @@ def _factors(around: Gaussians, foot: Gaussians, layer: _Layer, *, radius: float
 
 
 def _contact_layer(around: Gaussians, opaque: Gaussians, sphere: BoundingSphere) -> _Layer | None:
-    """Fit the layer that holds most of the surface near an object's Gaussians; None if there is no surface."""
+    """Fit the layer with most surface near an object's Gaussians; None without a surface."""
     around = _evenly(around.select(around.opacities > _OPAQUE), 5 * _MAX_USED)
     if not around.count:
         return None
@@ -195,7 +195,7 @@ def _fitted_layer(
         middle = on_plane @ means / on_plane.sum()
         offsets = means - middle
         normal = least_squares_normal(on_plane.sqrt()[:, None] * offsets).float()
-    if float(on_plane.sum()) < 0.25 * float(weights.sum()):  # as in a bush: most of the surface lies elsewhere
+    if float(on_plane.sum()) < 0.25 * float(weights.sum()):  # most of the surface lies elsewhere, as in a bush
         return None
     layer = _Layer(normal, float(middle.float() @ normal), 0.0)
     variances = layer.heights(near.means) ** 2 + layer.extents(near) ** 2

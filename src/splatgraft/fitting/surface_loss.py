@@ -1,8 +1,9 @@
 """Loss on inverse depth that holds plain surfaces, beside the photometric loss of a fit.
 
 Photographs alone leave the depth of a plain surface open: at any depth it gives the same pictures. Inverse depth is
-linear in the pixel on a plane. So the loss is the second difference of the mean inverse depth of rays over plain parts of a
-photograph, and a bare table is held by its textured rim. It is the planar prior of ACMP (Xu and Tao 2020) as a loss.
+linear in the pixel on a plane. So the loss is the second difference of the mean inverse depth of rays over plain parts
+of a photograph, and a bare table is held by its textured rim. It is the planar prior of ACMP (Xu and Tao 2020) as a
+loss.
 """
 
 from dataclasses import dataclass

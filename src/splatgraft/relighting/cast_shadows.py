@@ -1,4 +1,7 @@
-"""Shadow and bounce that objects cast on the scene around them and on one another, and the scene's shadows on them."""
+"""Shadows of a composite: of objects on the scene and on one another, and of the scene on objects.
+
+The package `shadows` lists the steps and their functions.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,9 +29,10 @@ from splatgraft.relighting.shadows.surface_views import views_of_surface
 from splatgraft.relighting.shadows.view_fit import fit_to_views
 
 SHADOW_POWER = 1.3
-"""Exponent of shadows under an estimated light whose sun no shadow shows: an average over what is possible has less
-contrast than the light itself. Fitted by benchmarks/fit_shadows.py."""
-_CATCHER_SPACING = 0.05  # object radii between two shadow catchers; set by hand
+"""Exponent of shadows under an estimated light when no observed shadow reveals the sun.
+
+Such an estimate averages over the possible lights, so it has less contrast than the true one. Fitted by
+benchmarks/fit_shadows.py."""
 
 
 @dataclass(frozen=True)
@@ -36,15 +40,15 @@ class Shadows:
     """The shadows of a composite with objects of n Gaussians each."""
 
     receivers: Receivers
-    """The Gaussians of the scene that some object reaches, wide ones split at shadow edges."""
+    """Gaussians of the scene that some object reaches, wide ones split at shadow edges."""
     on_scene: SceneRatio
     """Ratios of the receivers, by all objects together."""
     catchers: ShadowCatchers
-    """What shades what is seen behind the receivers."""
+    """Black Gaussians that shade the scene behind translucent receivers."""
     scene_visibility: tuple[Float[Tensor, "n k"], ...]
-    """Per object the share of every light sample that reaches its Gaussians past the scene, in [0, 1]."""
+    """Share of every light sample that reaches each object's Gaussians past the scene, in [0, 1]."""
     on_objects: tuple[SceneRatio, ...]
-    """Per object, by all others."""
+    """Ratios of each object's Gaussians, by all other objects."""
 
 
 def cast_shadows(
@@ -54,10 +58,10 @@ def cast_shadows(
 
     Args:
         scene: The light at the objects' place.
-        objects: All of them, prepared for that light.
-        drawn: The scene as a composite draws it, flattened around the objects' feet.
-        views: Cameras in which shadows are fitted to the surface that is seen; none for a quick draft.
-        budget: Most Gaussians that splitting may add to the scene.
+        objects: All objects, prepared for that light.
+        drawn: The scene in the composite, flattened around the objects' feet.
+        views: Cameras in which shadows are fitted to the visible surface; none for a quick draft.
+        budget: Largest number of Gaussians that splitting may add to the scene.
     """
     power = SHADOW_POWER if scene.estimate is not None and scene.estimate.sun is None else 1.0
     receivers, ratio, catchers = _on_scene(scene, objects, drawn, views, budget)
@@ -79,7 +83,7 @@ def cast_shadows(
 def _on_scene(
     scene: SceneLight, objects: Sequence[PreparedObject], drawn: Gaussians, views: Cameras, budget: int
 ) -> tuple[Receivers, SceneRatio, ShadowCatchers]:
-    """The receivers that some object reaches, split where needed; all objects' ratios on them; catchers."""
+    """Find and split the receivers that some object reaches, their ratios by all objects, and catchers."""
     all_receivers = scene.receivers
     points, rims = all_receivers.gaussians.means, RIM * all_receivers.gaussians.scales.max(1).values
     reached = torch.zeros(len(points), dtype=torch.bool)
@@ -117,13 +121,13 @@ def _on_scene(
     rest[receivers.origin] = False
     whole = concatenate([receivers.gaussians, drawn.select(rest)])
     shown = views_of_surface(receivers, total, whole, views, ratio_at=ratio_at)
-    spacing = _CATCHER_SPACING * min(one.sphere.radius for one in objects)
+    spacing = 0.05 * min(one.sphere.radius for one in objects)  # set by hand
     catchers = find_catchers(receivers, total, whole, shown, spacing=spacing)
     return receivers, fit_to_views(total, whole, shown, catchers.visible), catchers
 
 
 def _on_object(one: PreparedObject, others: Sequence[PreparedObject], visibility: Float[Tensor, "n k"]) -> SceneRatio:
-    """Shadow and bounce of all other objects on one."""
+    """Compute shadow and bounce of all other objects on one."""
     gaussians, normals = one.gaussians, one.normals.vectors
     shadow, bounce = torch.ones(gaussians.count, 3), torch.zeros(gaussians.count, 3)
     for other in others:

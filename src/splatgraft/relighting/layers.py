@@ -1,4 +1,4 @@
-"""The result of a light transfer: a composite with shading, shadow, bounce and gloss as layers to weight and bake."""
+"""Result of a light transfer: a composite with shading, shadow, bounce and gloss as layers to weight and bake."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -32,33 +32,30 @@ from splatgraft.relighting.shading import (
 from splatgraft.relighting.shadows.catchers import with_depth
 from splatgraft.runtime.note import Note
 
-_MAX_VIEW_CHANGE = 0.9  # share of the light in a shadow that a view direction takes away; set by hand
-_MIN_SLOPE = 1e-6
-"""Smallest slope of a ratio over view directions; below it nothing is seen, and divisions would overflow."""
-_MIN_CERTAIN = 0.5
-"""Share of the light that was captured and whose direction is certain, below which most of it is a guess."""
-_DARKEST, _HARDLY_DARKER = 20, 0.85
-"""Surroundings that are asked for a shadow, the darkest, and the factor on their light above which none is seen."""
+_MIN_SLOPE = 1e-6  # slope of a ratio over view directions; smaller ones are invisible, and below 1e-20 squares are 0
 
 
 @dataclass(frozen=True)
 class LayerWeights:
-    """How much of each layer is baked: 0 leaves it out, 1 is physically right, more exaggerates; and an exposure."""
+    """Weights of the layers in a baked scene, and an exposure.
+
+    A weight of 0 omits a layer, 1 is physically right, more exaggerates.
+    """
 
     shade: float = 1.0
     """The object's own light and dark sides."""
     shadow: float = 1.0
-    """What the object takes from its surroundings."""
+    """The object's shadow on its surroundings."""
     bounce: float = 1.0
-    """What the object's lit sides give to its surroundings."""
+    """Light that the object reflects onto its surroundings."""
     gloss: float = 1.0
     """Reflections on the object."""
     tint: float = 1.0
-    """The change of colour within the object's shade; its brightness stays."""
+    """Change of colour within the object's shade; the brightness stays."""
     exposure: float = 0.0
-    """Stops by which the object is brighter than computed, its reflections excepted; 0 is physically right."""
+    """Extra brightness of the object, except of its reflections, stops; 0 is physically right."""
     warmth: float = 0.0
-    """Stops by which red gains on blue on the object, at the same brightness; 0 is physically right."""
+    """Extra red over blue on the object at the same brightness, stops; 0 is physically right."""
 
 
 @dataclass(frozen=True)
@@ -66,56 +63,57 @@ class Relit:
     """A composite of m Gaussians with its light transfer in layers."""
 
     gaussians: Gaussians
-    """The plain composite: the target's Gaussians, then the objects'; large ones in a shadow are split, and invisible
-    shadow catchers added."""
+    """Gaussians without any layer: the target's, then the objects'; large ones in a shadow are split, and invisible
+    shadow catchers are added."""
     is_object: Bool[Tensor, "m"]
-    """Which Gaussians belong to an object."""
+    """Whether each Gaussian belongs to an object."""
     origin: Int[Tensor, "m"]
-    """Position in `Composite.merged()` of the Gaussian that each one is, is a piece of, or catches the shadow at."""
+    """Position of each Gaussian, or of its whole, in `Composite.merged()`; for a catcher that of the surface there."""
     shade: Float[Tensor, "m 3"]
     """Factor on linear rgb; 1 outside the objects."""
     shadow: Float[Tensor, "m 3"]
     """Factor on linear rgb in (0, 1]; 1 without a shadow."""
     bounce: Float[Tensor, "m 3"]
-    """Added to `shadow`, at least 0: light that an object reflects, as a share of the light without it."""
+    """Light reflected by objects over the light without them, at least 0; added to `shadow`."""
     slope: Float[Tensor, "m 3"]
     """View dependence, world axes: its product with the unit vector from the camera is added to shadow and bounce."""
     catcher_depth: Float[Tensor, "m"]
-    """Optical depth of the shadow catchers, which are invisible without it; 0 for all other Gaussians."""
+    """Optical depth of shadow catchers, invisible at 0; 0 for all other Gaussians."""
     gloss: Float[Tensor, "m k 3"]
     """Coefficients that are added to the harmonics after shading."""
     bands_replaced: Bool[Tensor, "m"]
-    """Whose own higher bands `gloss` replaces: they show what reflected the old light."""
+    """Whether `gloss` replaces a Gaussian's own higher bands, which show reflections of the old light."""
     objects: tuple[Gaussians, ...]
-    """The placed objects, target's frame."""
+    """Placed objects, target's frame."""
     light: Light | None
-    """At the objects' place; None where there was no transfer."""
+    """Light at the objects' place; None if there was no transfer."""
     report: tuple[Note, ...]
-    """The lights that were found and their uncertainty, and what was not done and why."""
+    """Lights that were found, their uncertainty, and reasons for steps that were not done."""
     estimate: EstimatedLight | None = None
-    """What `light` rests on; None where it was given or there was no transfer."""
+    """Evidence for `light`; None if the light was given or there was no transfer."""
     received: tuple[Float[Tensor, "n 3"], ...] = ()
     """Linear rgb irradiance on the Gaussians of each object at the new place."""
     prepared: tuple[PreparedObject, ...] = ()
-    """Per object its normals and the light that it was captured in; empty where there was no transfer."""
+    """Normals and old light of each object; empty if there was no transfer."""
 
     @property
     def confidence(self) -> float:
-        """How reliable the light is, in [0, 1]; 0 where there was no transfer."""
+        """Reliability of the light, in [0, 1]; 0 if there was no transfer."""
         return 0.0 if self.light is None else light_confidence(self.light)
 
     def bake(self, weights: LayerWeights = LayerWeights()) -> tuple[Gaussians, Bool[Tensor, "b"]]:
-        """The scene to write or to draw, and which of its Gaussians belong to an object.
-
-        Wide Gaussians of the target around the objects are split, as in `Composite.bake`.
+        """Apply the layers, and split wide Gaussians of the target around the objects, as `Composite.bake` does.
 
         Args:
-            weights: How much of each layer is applied.
+            weights: Weight of each layer.
+
+        Returns:
+            The scene to write or to draw, and whether each of its Gaussians belongs to an object.
         """
         return split_wide_around(self.shaded(weights), self.is_object, self.objects)
 
     def shaded(self, weights: LayerWeights = LayerWeights()) -> Gaussians:
-        """The m Gaussians under the layers, in the order of `gaussians`; those that no layer changes keep every bit."""
+        """Apply the layers to the m Gaussians, in the order of `gaussians`; unchanged ones keep every bit."""
         ratio = self.ratio(weights)
         sloped = (weights.shadow * self.slope != 0).any(1).nonzero()[:, 0]
         glossy = (
@@ -143,7 +141,7 @@ class Relit:
         return replace(changed, opacity_logits=logits)
 
     def ratio(self, weights: LayerWeights = LayerWeights()) -> Float[Tensor, "m 3"]:
-        """Factor on linear rgb that shade, tint, exposure, warmth, shadow and bounce make together."""
+        """Compute the factor on linear rgb of shade, tint, exposure, warmth, shadow and bounce together."""
         shade = self.shade**weights.shade
         if weights.tint != 1:
             shade = _tinted(shade, weights.tint)
@@ -156,24 +154,24 @@ class Relit:
 
 
 def _tinted(factor: Float[Tensor, "m 3"], weight: float) -> Float[Tensor, "m 3"]:
-    """A factor on linear rgb with its chromaticity to the power of `weight`, of the same luminance."""
+    """Raise the chromaticity of a factor on linear rgb to the power of `weight`, at the same luminance."""
     luminance = (factor @ LUMINANCE)[:, None].clamp_min(1e-6)
     chroma = (factor / luminance).clamp_min(1e-6) ** weight
     changed = luminance * chroma / (chroma @ LUMINANCE)[:, None]
-    # what is grey keeps every bit
+    # grey factors keep every bit
     return torch.where((factor == factor[:, :1]).all(1, keepdim=True), factor, changed)
 
 
 def _srgb_slope(
     srgb: Float[Tensor, "n 3"], ratio: Float[Tensor, "n 3"], slope: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3 3"]:
-    """Slope of sRGB colours along the world's axes (second dimension) where `ratio` of linear light has `slope`.
+    """Compute slopes of sRGB colours along the world's axes (second dimension) from a slope of linear light's `ratio`.
 
-    By the secant between both ends, limited so that neither is black nor brighter than without a shadow.
+    The slope is the secant between both ends of the view directions. It is limited so that neither end is black or
+    brighter than without a shadow.
     """
-    # the squares of slopes below 1e-20 are 0 in float32
     length = slope.norm(dim=1, keepdim=True).clamp_min(_MIN_SLOPE)
-    most = torch.minimum(_MAX_VIEW_CHANGE * ratio, (1 - ratio).clamp_min(0))
+    most = torch.minimum(0.9 * ratio, (1 - ratio).clamp_min(0))  # a tenth of the light stays; set by hand
     change = torch.minimum(length, most).clamp_min(_MIN_SLOPE)
     linear = linear_from_srgb(srgb.clamp(0, 1))
     high, low = (srgb_from_linear(linear * (ratio + sign * change)) for sign in (1, -1))
@@ -182,24 +180,24 @@ def _srgb_slope(
 
 @dataclass(frozen=True)
 class _Shading:
-    """How an object of n Gaussians is lit."""
+    """Shading of an object of n Gaussians at its new place."""
 
     received: Float[Tensor, "n 3"]
-    """Linear rgb irradiance at the new place."""
+    """Linear rgb irradiance."""
     shade: Float[Tensor, "n 3"]
-    """Factor on linear rgb by its own shading."""
+    """Factor on linear rgb."""
     gloss: Float[Tensor, "n 16 3"] | None
-    """Coefficients of what it reflects at its new place; None where it is matt."""
+    """Coefficients of the gloss layer; None for a matt object."""
 
 
 def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[PreparedObject], shadows: Shadows) -> Relit:
-    """Shade the objects, and put all layers in the order of the merged composite; pieces where their whole was.
+    """Shade the objects, and sort all layers in the order of the merged composite, pieces at the place of their whole.
 
     Args:
-        merged: The composite, as `Composite.merged` gives it.
+        merged: Result of `Composite.merged`.
         scene: The light at the objects' place.
-        objects: All that have Gaussians.
-        shadows: Of that light.
+        objects: All objects that have Gaussians.
+        shadows: Shadows under that light.
     """
     shadings = [_shading(one, scene, shares) for one, shares in zip(objects, shadows.scene_visibility, strict=True)]
     receivers, on_scene, catchers = shadows.receivers, shadows.on_scene, shadows.catchers
@@ -236,36 +234,36 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
 
 
 def _light_note(scene: SceneLight) -> Note:
-    """What the light at the new place is, and whether most of it is a guess."""
+    """Describe the light at the new place, and warn if most of it is a guess."""
     end = "." if scene.estimate is not None else ", as given."
     text = f"At the new place: {describe_light(scene.light, scene.captured.up)}{end}"
     certain = light_confidence(scene.light)
-    if certain >= _MIN_CERTAIN:
+    if certain >= 0.5:
         return Note(text)
     remedy = (
-        f"Most of this light is a guess ({certain:.0%} of it was captured with a certain direction): photograph what "
-        "surrounds the place, or give the light (--given-light)."
+        f"Most of this light is a guess ({certain:.0%} of it was captured with a certain direction), so shading and "
+        "shadows may be wrong: photograph the surroundings of the place, or give the light (--given-light)."
     )
     return Note(text, "warning", remedy)
 
 
 def _shadow_notes(shadow: Float[Tensor, "n 3"]) -> tuple[Note, ...]:
-    """A warning where no shadow is seen: what stands on something keeps light from its foot under any light.
+    """Warn if no shadow is visible, because an object that stands on a surface shades its foot under any light.
 
     Args:
-        shadow: Factors on the light of what surrounds the objects.
+        shadow: Factors on the light of the n receivers.
     """
-    darkest = float(shadow.mean(1).sort().values[:_DARKEST].mean()) if len(shadow) else 1.0
-    if darkest < _HARDLY_DARKER:
+    darkest = float(shadow.mean(1).sort().values[:20].mean()) if len(shadow) else 1.0
+    if darkest < 0.85:
         return ()
-    text = f"Hardly any shadow is seen: where it is darkest it takes {1 - darkest:.0%} of the light."
-    return (Note(text, "warning", "Set the object down on what is under it, or set the sun by hand (--sun-through)."),)
+    text = f"Hardly any shadow is visible: even the darkest takes only {1 - darkest:.0%} of the light."
+    return (Note(text, "warning", "Set the object down on its support, or set the sun by hand (--sun-through)."),)
 
 
 def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Tensor, "n k"]) -> _Shading:
-    """The object's shading by the scene's light, ambient light included."""
+    """Shade an object by the scene's light, ambient light included."""
     normals, opacities = one.normals.vectors, one.gaussians.opacities
-    # the ambient light was captured at the place itself, where blockers are part of the panorama; so in the source
+    # the scene blocks no ambient light: it is part of the panorama that was captured at the place; as for the source
     shares = torch.where(torch.as_tensor(scene.samples.is_source), scene_visibility, torch.ones(()))
     shares = one.self_visibility * shares
     received = irradiance(scene.samples, normals, sample_visibility=shares)
@@ -282,7 +280,7 @@ def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Ten
 
 
 def _gloss_layer(gaussians: Gaussians, shadings: Sequence[_Shading]) -> Float[Tensor, "m k 3"]:
-    """The gloss layer of all m Gaussians, the objects' last; of degree 3 where something is glossy."""
+    """Assemble the gloss layer of all m Gaussians, the objects' last; its degree is 3 if something is glossy."""
     if all(one.gloss is None for one in shadings):
         return torch.zeros_like(gaussians.sh)
     count = spherical_harmonics.coefficient_count(spherical_harmonics.MAX_DEGREE)
@@ -292,7 +290,7 @@ def _gloss_layer(gaussians: Gaussians, shadings: Sequence[_Shading]) -> Float[Te
 
 
 def pasted(composite: Composite, reason: str) -> Relit:
-    """The copy-paste result, with the reason why there is no transfer."""
+    """Return the copy-paste result, with the reason for the missing transfer in its report."""
     gaussians, is_object = composite.merged()
     ones = torch.ones(gaussians.count, 3)
     return Relit(

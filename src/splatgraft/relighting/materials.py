@@ -1,9 +1,12 @@
-"""Gloss of an object's materials: fitted to its views under the old light, and shown under the new one.
+"""Gloss of an object's materials, fitted to its views under the old light and shown under the new light.
 
-Per cluster of like colour and place one lobe is fitted by least squares: the part of the seen colours that changes
-with the view is a reflectance times the light in mirrored directions. What a Gaussian shows beside it is matt. Lobes
-are von Mises-Fisher densities (reflection as convolution, Ramamoorthi and Hanrahan 2001): each light sample is
-convolved with one by adding variances, the ambient harmonics by the lobe's own coefficients.
+1. Cluster the Gaussians by colour and place (`_clusters`).
+2. Fit one reflection lobe to each cluster by least squares: the view-dependent part of its colours is a reflectance
+   times the light in mirrored directions (`_fitted`). The rest of the colours is matt.
+3. Project the lobes under the new light to harmonics (`gloss_bands`).
+
+Lobes are von Mises-Fisher densities (reflection as convolution, Ramamoorthi and Hanrahan 2001). The convolution of a
+lobe with a light sample adds variances; with the ambient harmonics it multiplies them by the lobe's coefficients.
 """
 
 import math
@@ -26,10 +29,10 @@ from splatgraft.relighting.shading import apply_gain
 
 @dataclass(frozen=True)
 class ReflectedLight:
-    """A light as n surface points reflect it."""
+    """A light at n surface points, in the form that reflections need."""
 
     directions: Float[Tensor, "k 3"]
-    """Unit, towards the samples of its sources."""
+    """Unit, towards the k samples of its sources."""
     irradiance: Float[Tensor, "k 3"]
     """Linear rgb of each sample."""
     softness: Float[Tensor, "k"]
@@ -37,28 +40,28 @@ class ReflectedLight:
     visibility: Float[Tensor, "n k"]
     """Share of each sample that reaches each point, in [0, 1]."""
     ambient: Float[Tensor, "9 3"]
-    """Radiance of everything else, harmonics of degree 2."""
+    """Radiance of all other light, harmonics of degree 2."""
 
     def select(self, rows: slice | Int[Tensor, "m"]) -> "ReflectedLight":
-        """The light at some of the points."""
+        """Select the light at m of the points."""
         return replace(self, visibility=self.visibility[rows])
 
     def scaled(self, factor: Float[Tensor, "3"]) -> "ReflectedLight":
-        """The light with every channel multiplied by a factor."""
+        """Multiply every channel of the light by a factor."""
         return replace(self, irradiance=self.irradiance * factor, ambient=self.ambient * factor)
 
     def radiance(self, directions: Float[Tensor, "n v 3"], concentration: float) -> Float[Tensor, "n v 3"]:
-        """Linear rgb radiance at n points, averaged over lobes around v unit directions each.
+        """Average linear rgb radiance at n points over lobes around v directions each.
 
         Args:
             directions: Unit, away from the surface.
-            concentration: Of the lobes; one over the square of their width in radians.
+            concentration: Concentration of the lobes: one over the square of their width in radians.
         """
         first = 1 / math.tanh(concentration) - 1 / concentration
         bands = torch.tensor([1.0] + [first] * 3 + [1 - 3 * first / concentration] * 5)
         total = (spherical_harmonics.basis(directions, 2) @ (bands[:, None] * self.ambient)).clamp_min(0)
         for i in range(len(self.directions)):
-            # per axis the variance of a cone of radius r is r^2 / 4, that of a lobe is 1 / concentration
+            # variances per axis add: r^2 / 4 for a cone of radius r, and 1 / concentration for a lobe
             k = 1 / (1 / concentration + 0.25 * float(self.softness[i]) ** 2)
             peak = k / (2 * math.pi * (1 - math.exp(-2 * k)))
             lobe = peak * torch.exp(k * (directions @ self.directions[i] - 1)) * self.visibility[:, i : i + 1]
@@ -67,11 +70,11 @@ class ReflectedLight:
 
 
 def reflected_light(light: Light, samples: LightSamples, visibility: Float[Tensor, "n k"]) -> ReflectedLight:
-    """The light as n points reflect it.
+    """Convert a light to the form that reflections at n points need.
 
     Args:
         light: The light.
-        samples: Of that light, k.
+        samples: The k samples of that light.
         visibility: Share of each sample that reaches each point, in [0, 1].
     """
     sources = samples.of_sources
@@ -87,47 +90,43 @@ def reflected_light(light: Light, samples: LightSamples, visibility: Float[Tenso
     )
 
 
-_CHUNK = 8192  # gaussians at a time; bounds memory
-_MAX_FITTED = 8192  # gaussians that lobes are fitted to, spread over the object; more add time and change nothing
-_ROUNDS = 15  # rounds of k-means
+_CHUNK = 8192  # Gaussians at a time; bounds memory
+_MAX_FITTED = 8192  # Gaussians that lobes are fitted to, spread over the object; more add time and change nothing
 
-# the model's few numbers; on twelve rendered scenes of given true light the result is flat around all of them
+# the model; on twelve rendered scenes with true lights the result is flat around all of these
 _CLUSTERS = 6  # clusters of colour and place; 2 to 16 give the same PSNR within 0.02 dB
-_CONCENTRATIONS = (1.5, 3.0, 6.0, 12.0, 25.0)
-"""Concentrations of the lobes that are tried, from satin to polished; bands of degree 3 hold no finer ones."""
-_EVIDENCE = 0.05
-"""Explained share of the change with the view at which a lobe is believed by half: shares of pure noise."""
+_CONCENTRATIONS = (1.5, 3.0, 6.0, 12.0, 25.0)  # lobes from satin to polished; bands of degree 3 hold no finer ones
+_EVIDENCE = 0.05  # explained share of pure noise; a lobe that explains as much keeps half of its reflectance
 _LOWEST_COSINE = 0.1  # between normal and view; flatter views are left out
-_MIN_MATT = 0.2  # share of a Gaussian's colour that stays, whatever the lobe explains
-_FACING = 0.04  # reflectance at normal incidence relative to grazing, of a dielectric (Schlick 1994)
-_MIRROR = 0.3  # reflectance from which the sharpest lobe is called a mirror
+_MIN_MATT = 0.2  # smallest matt share of a Gaussian's colour
+_FACING = 0.04  # reflectance of a dielectric at normal incidence over grazing incidence (Schlick 1994)
 
 
 @dataclass(frozen=True)
 class Materials:
-    """One lobe for each of n Gaussians, and what is matt."""
+    """One reflection lobe for each of n Gaussians, and their matt colours."""
 
     reflectance: Float[Tensor, "n 3"]
-    """Linear rgb share of the light in the lobe that is reflected, at least 0; 0 where nothing tells of gloss."""
+    """Reflected share of the light in the lobe, linear rgb, at least 0; 0 without evidence of gloss."""
     concentration: Float[Tensor, "n"]
     """Concentration of the lobe."""
     dielectric: Bool[Tensor, "n"]
-    """Whether reflectance grows towards grazing views (Schlick 1994); otherwise it is even, as that of a metal."""
+    """Whether reflectance grows towards grazing views (Schlick 1994); otherwise it is constant, as for a metal."""
     matt: Float[Tensor, "n 3"]
     """Linear rgb under the old light, without the lobe."""
     share: Float[Tensor, "n"]
-    """Share of what was seen under the old light that the lobe gave, in [0, 1]."""
+    """Share of the lobe in the colour under the old light, in [0, 1]."""
 
     @property
     def glossy(self) -> Bool[Tensor, "n"]:
-        """Which Gaussians have a lobe."""
+        """Whether each Gaussian has a lobe."""
         return (self.reflectance > 0).any(1)
 
     @property
     def mirrors(self) -> Bool[Tensor, "n"]:
-        """Which Gaussians are mirrors, whose reflections bands can only blur."""
+        """Whether each Gaussian is a mirror, with reflections too sharp for its bands."""
         sharpest = self.concentration >= max(_CONCENTRATIONS)
-        return sharpest & ~self.dielectric & (self.reflectance.mean(1) > _MIRROR)
+        return sharpest & ~self.dielectric & (self.reflectance.mean(1) > 0.3)
 
 
 def estimate_materials(
@@ -136,13 +135,13 @@ def estimate_materials(
     """Fit the lobes of an object's materials.
 
     Args:
-        gaussians: The n Gaussians of the object, with the bands that its capture gave them.
+        gaussians: The n Gaussians of the object, with the bands of its capture.
         normals: Unit, outward.
-        views: Of the object alone, from its capture's cameras.
-        light: That it was captured in.
+        views: Views of the object alone, from its capture's cameras.
+        light: The light that the object was captured in.
 
     Returns:
-        Lobes in the light's units, all 0 where the Gaussians have no bands or no camera sees them.
+        Lobes in the light's units, all 0 if the Gaussians have no bands or no camera sees them.
     """
     base = linear_from_srgb(spherical_harmonics.rgb_from_dc(gaussians.sh[:, 0]).clamp_min(0))
     n = gaussians.count
@@ -173,7 +172,7 @@ def estimate_materials(
     taken = torch.where(old > 1e-6, (1 - _MIN_MATT) * base / old.clamp_min(1e-6), torch.zeros(())).clamp(0, 1)
     return replace(
         lobes,
-        # no more of the lobe is put in than is taken out
+        # the new light gets no more of the lobe than was subtracted under the old one
         reflectance=lobes.reflectance * taken,
         matt=left,
         share=1 - left.sum(1) / base.sum(1).clamp_min(1e-6),
@@ -187,14 +186,14 @@ def lobe_radiance(
     mirrored: Float[Tensor, "m v 3"],
     cosine: Float[Tensor, "m v"],
 ) -> Float[Tensor, "m v 3"]:
-    """Linear rgb that the lobes of some Gaussians add in v views.
+    """Compute the linear rgb that the lobes of m Gaussians add in v views.
 
     Args:
-        materials: Of all Gaussians.
-        rows: The m Gaussians.
-        light: At all Gaussians.
-        mirrored: Unit, the views' directions mirrored by the surface.
-        cosine: Between the normals and the directions to the cameras.
+        materials: Materials of all Gaussians.
+        rows: Rows of the m Gaussians.
+        light: The light at all Gaussians.
+        mirrored: Directions of the views mirrored by the surface, unit.
+        cosine: Cosine between normals and directions to the cameras.
     """
     reflectance, concentration = materials.reflectance[rows], materials.concentration[rows]
     out = torch.zeros(mirrored.shape)
@@ -218,17 +217,20 @@ def _schlick(cosine: Float[Tensor, "m v"], facing: float) -> Float[Tensor, "m v"
 
 @dataclass(frozen=True)
 class _Record:
-    """What v views show of n Gaussians."""
+    """Observations of n Gaussians in v views."""
 
     colors: Float[Tensor, "n v 3"]
-    """Linear rgb, the mean of each picture over the pixels that the Gaussian covers."""
+    """Linear rgb, averaged over the Gaussian's pixels in each view."""
     weight: Float[Tensor, "n v"]
-    """Weight of each view; they sum to 1, or to 0 where no view counts."""
+    """Weight of each view; the sum is 1, or 0 for a Gaussian that no view shows."""
     pixels: Float[Tensor, "n"]
-    """That the Gaussian covers in all views."""
+    """Number of pixels that the Gaussian covers in all views."""
     directions: Float[Tensor, "n v 3"]
+    """Unit, from the cameras to the Gaussian."""
     cosine: Float[Tensor, "n v"]
+    """Cosine between the normal and the direction to each camera."""
     normals: Float[Tensor, "n 3"]
+    """Unit, outward."""
 
     @property
     def mean(self) -> Float[Tensor, "n 3"]:
@@ -236,11 +238,11 @@ class _Record:
         return (self.weight[..., None] * self.colors).sum(1)
 
     def mirrored(self, rows: slice | Int[Tensor, "m"]) -> Float[Tensor, "m v 3"]:
-        """View directions mirrored by the surface."""
+        """Mirror the view directions by the surface."""
         return self.directions[rows] + 2 * self.cosine[rows][..., None] * self.normals[rows][:, None]
 
     def centred(self, values: Float[Tensor, "m v 3"], rows: slice | Int[Tensor, "m"]) -> Float[Tensor, "m v 3"]:
-        """Values without each Gaussian's mean over the views."""
+        """Subtract each Gaussian's mean over the views from values."""
         return values - (self.weight[rows][..., None] * values).sum(1, keepdim=True)
 
     @staticmethod
@@ -249,7 +251,7 @@ class _Record:
         for view in views:
             alpha = view.operator.alpha[..., None]
             picture = view.operator.blend(spherical_harmonics.colors(gaussians.sh, view.directions))
-            shown = (alpha > 0.5).float()  # thinner pixels show what is behind the object
+            shown = (alpha > 0.5).float()  # thinner pixels also show the background
             linear = linear_from_srgb((picture / alpha.clamp_min(1e-6)).clamp(0, 1)) * shown
             sums = view.operator.blend_transpose(torch.cat([linear, shown], 2).contiguous())
             colors.append(sums[:, :3] / sums[:, 3:].clamp_min(1e-6))
@@ -269,24 +271,24 @@ class _Record:
 
 
 def _clusters(mean: Float[Tensor, "n 3"], points: Float[Tensor, "n 3"], count: int) -> Int[Tensor, "n"]:
-    """Clusters of chromaticity, brightness and place by k-means, first centres farthest from one another."""
+    """Cluster chromaticity, brightness and place by k-means; the first centres lie far apart."""
     srgb = mean.clamp_min(0) ** (1 / 2.2)
     gray = srgb.mean(1, keepdim=True)
     place = (points - points.mean(0)) / (points - points.mean(0)).norm(dim=1).quantile(0.9).clamp_min(1e-9)
-    # chromaticity tells materials apart best, shading changes brightness, and parts lie apart: weights by hand
+    # chromaticity separates materials best, because shading changes brightness; place separates parts; set by hand
     features = torch.cat([2 * (srgb - gray) / (gray + 0.1), 0.5 * gray, 0.5 * place], 1)
     first = [int(((features - features.mean(0)) ** 2).sum(1).argmin())]
     nearest = torch.full((len(features),), torch.inf)
     for _ in range(min(count, len(features)) - 1):
         nearest = torch.minimum(nearest, ((features - features[first[-1]]) ** 2).sum(1))
         first.append(int(nearest.argmax()))
-    return torch.cdist(features, k_means(features, features[first], rounds=_ROUNDS)).argmin(1)
+    return torch.cdist(features, k_means(features, features[first], rounds=15)).argmin(1)
 
 
 def _fitted(
     record: _Record, cluster: Int[Tensor, "n"], light: ReflectedLight
 ) -> tuple[Float[Tensor, "c 3"], Float[Tensor, "c"], Bool[Tensor, "c"]]:
-    """Per cluster the reflectance, concentration and kind of the lobe that explains most."""
+    """Fit reflectance, concentration and kind of each cluster's best lobe."""
     shapes = [(value, kind) for value in _CONCENTRATIONS for kind in (False, True)]
     count = int(cluster.max()) + 1
     own, cross, square = (torch.zeros(len(shapes), count, 3) for _ in range(3))
@@ -312,9 +314,9 @@ def _fitted(
     return believed[:, None] * reflectance[best, each], values[best], kinds[best]
 
 
-_GLOSS_CHUNK = 4096  # gaussians at a time; bounds memory
-_VIEWS = 64  # directions over the sphere; twice as many as are needed to integrate products of degree 3 without error
-_BRIGHTEST = 1.5  # linear; brighter reflections are clipped, which keeps bands from ringing over the whole object
+_GLOSS_CHUNK = 4096  # Gaussians at a time; bounds memory
+_VIEWS = 64  # directions over the sphere; twice the number that integrates products of degree 3 exactly
+_BRIGHTEST = 1.5  # linear; brighter reflections are clipped, so that bands do not ring over the whole object
 
 
 def gloss_bands(
@@ -325,14 +327,14 @@ def gloss_bands(
     *,
     shade: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "n 16 3"]:
-    """Coefficients that are added after shading and after the old bands are taken out; 0 where nothing is glossy.
+    """Compute coefficients that are added after shading, when the old bands are removed; 0 for matt Gaussians.
 
     Args:
         gaussians: The object.
         normals: Unit, outward.
-        materials: Of the object.
-        light: At the new place, in the units of the old one.
-        shade: Factor on linear rgb of what is matt.
+        materials: Materials of the object.
+        light: The light at the new place, in the units of the old light.
+        shade: Factor on the linear rgb of matt colours.
     """
     degree = spherical_harmonics.MAX_DEGREE
     views = even_directions(_VIEWS)
@@ -345,7 +347,7 @@ def gloss_bands(
             continue
         facing = normals[rows][:, None]
         towards = -(views * facing).sum(-1)
-        # both a direction and its image in the tangent plane are mirrored to the same side
+        # views from behind the surface take the reflection of their mirror image in front
         cosine = towards.abs()
         in_front = views + (towards - cosine)[..., None] * facing
         lobe = lobe_radiance(materials, rows, light, in_front + 2 * cosine[..., None] * facing, cosine)

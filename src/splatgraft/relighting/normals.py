@@ -1,8 +1,9 @@
 """Surface normals of Gaussians with a confidence, turned towards the cameras that see them.
 
-A Gaussian and its nearest neighbours are taken as a mixture; the shortest axis of the mixture's covariance is the
-normal. The covariance joins the Gaussian's own shape, its neighbours' shapes and their positions, so the normal is
-defined for round Gaussians too. Which camera sees a Gaussian follows from a small depth image.
+1. Find the cameras that see each Gaussian, by small depth images.
+2. Compute the covariance of the mixture of each Gaussian and its nearest neighbours. Its shortest axis is the normal.
+   It holds the shapes and the positions of all, so round Gaussians have a normal too.
+3. Average the normals of neighbours, weighted by confidence.
 """
 
 from collections.abc import Sequence
@@ -22,14 +23,11 @@ from splatgraft.rendering import Render, render
 from splatgraft.runtime.kernels import kernel, serialized
 
 # set by hand
-_NEIGHBOURS = 16  # gaussians per mixture
-_CAMERAS, _CAMERA_PX = 8, 128
-"""Cameras whose view is tested where none is given, and the longest side of their depth images, pixels."""
+_NEIGHBOURS = 16  # Gaussians per mixture
 _UNSEEN_CONFIDENCE = 0.5  # factor on the confidence of normals that no tested camera sees
-_RAISED = 1.5  # standard deviations along the normal from a Gaussian's centre to where its surface is visible
+_RAISED = 1.5  # standard deviations from a Gaussian's centre to its visible surface, along the normal
 _OWN_WEIGHT = 0.5  # weight of a Gaussian's own covariance beside the mixture's, both scaled to trace 1
-_FLATNESS_GAIN = 2
-"""1 - thickness / width, times this, is the confidence: a Gaussian twice as wide as thick is a surface."""
+_FLATNESS_GAIN = 2  # confidence over (1 - thickness / width): a mixture twice as wide as thick is a surface
 
 
 @dataclass(frozen=True)
@@ -37,26 +35,26 @@ class Normals:
     """Surface normals of n Gaussians."""
 
     vectors: Float[Tensor, "n 3"]
-    """Unit, world frame, towards the cameras."""
+    """Unit normals, world frame, towards the cameras."""
     confidence: Float[Tensor, "n"]
-    """In [0, 1]: 0 where neighbours form a round cloud or disagree, 1 on a plane."""
+    """Confidence in [0, 1]: 0 for neighbours that form a round cloud or disagree, 1 on a plane."""
     seen: Bool[Tensor, "n"]
-    """Whether some camera sees it unoccluded; the colour of others was never observed."""
+    """Whether some camera sees the Gaussian unoccluded; the colours of all others were never observed."""
 
     def select(self, rows: Int[Tensor, "m"]) -> "Normals":
-        """Those of some of the Gaussians."""
+        """Select the normals of m Gaussians."""
         return Normals(self.vectors[rows], self.confidence[rows], self.seen[rows])
 
 
 def estimate_normals(
     gaussians: Gaussians, cameras: Cameras, *, views: Sequence[tuple[Cameras, Render]] | None = None
 ) -> Normals:
-    """Normals of `gaussians`, towards the cameras that see each one; with less confidence where none does.
+    """Estimate normals towards the cameras that see each Gaussian; confidence is lower if none does.
 
     Args:
         gaussians: n Gaussians.
-        cameras: Of their capture.
-        views: The depth of `gaussians` in single cameras, which are tested; by default in a few, spread over the list.
+        cameras: Cameras of their capture.
+        views: Single cameras with their depth of `gaussians`, to test visibility; by default 8 of `cameras`.
     """
     n = gaussians.count
     if n == 0:
@@ -72,20 +70,20 @@ def estimate_normals(
 
 
 def raised(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Points on the visible side of each Gaussian: 1.5 standard deviations above its centre along its unit normal."""
+    """Raise points from each Gaussian's centre to its visible side, 1.5 standard deviations along its unit normal."""
     half = torch.einsum("nij,ni->nj", gaussians.rotations, normals) * gaussians.scales
     return gaussians.means + _RAISED * half.norm(dim=1, keepdim=True) * normals
 
 
 def _depth_views(gaussians: Gaussians, cameras: Cameras) -> list[tuple[Cameras, Render]]:
-    small = cameras.spread(_CAMERAS).limited(_CAMERA_PX)
+    small = cameras.spread(8).limited(128)  # pixels
     return [(camera, render(gaussians, camera, outputs=frozenset({"depth"}))) for camera in small]
 
 
 def _towards_cameras(
     gaussians: Gaussians, views: Sequence[tuple[Cameras, Render]]
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-    """Sum of unit vectors to the cameras that see each Gaussian (to all where none does), and whether any does."""
+    """Sum unit vectors to the cameras that see each Gaussian, or to all if none does; return also whether any does."""
     total = np.zeros((2, gaussians.count, 3), np.float32)
     for camera, drawn in views:
         seen = is_seen(gaussians, camera, drawn).numpy()
@@ -112,7 +110,7 @@ def _add_directions(means, center, seen, total):
 @kernel(inline="always")
 @no_type_check
 def _shortest_axis(xx, xy, xz, yy, yz, zz):
-    """Unit eigenvector of the smallest eigenvalue of a symmetric matrix, and 1 - sqrt(smallest / middle)."""
+    """Compute the unit eigenvector of a symmetric matrix's smallest eigenvalue, and 1 - sqrt(smallest / middle)."""
     mean = (xx + yy + zz) / 3
     a, b, c = xx - mean, yy - mean, zz - mean
     p = np.sqrt((a * a + b * b + c * c + 2 * (xy * xy + xz * xz + yz * yz)) / 6)
@@ -123,7 +121,7 @@ def _shortest_axis(xx, xy, xz, yy, yz, zz):
     smallest = mean + 2 * p * np.cos(angle + 2 * np.pi / 3)
     middle = 3 * mean - smallest - (mean + 2 * p * np.cos(angle))
     a, b, c = xx - smallest, yy - smallest, zz - smallest
-    # the eigenvector is perpendicular to any two rows; the longest of the three products is the most accurate
+    # the eigenvector is perpendicular to all rows; the longest of their cross products is the most accurate
     best_x, best_y, best_z, longest = 0.0, 0.0, 1.0, 0.0
     for r in range(3):
         if r == 0:
@@ -203,18 +201,18 @@ def _smoothed(normals, neighbours):
 
 
 # set by hand
-_SURFACE_ALPHA = 0.5  # A pixel of at least this alpha shows a surface
-_DEPTH_TOLERANCE = np.float32(0.005)  # share of its depth by which a Gaussian may lie behind the surface
-_BEHIND = 2  # standard deviations by which it may lie behind, besides
+_SURFACE_ALPHA = 0.5  # smallest alpha of a pixel that shows a surface
+_DEPTH_TOLERANCE = np.float32(0.005)  # share of its depth by which a visible Gaussian may lie behind the surface
+_BEHIND = 2  # standard deviations that are added to this tolerance
 
 
 def is_seen(gaussians: Gaussians, camera: Cameras, drawn: Render) -> Bool[Tensor, "n"]:
-    """Whether one camera sees each Gaussian's centre.
+    """Test whether one camera sees each Gaussian's centre.
 
     Args:
         gaussians: The n Gaussians that are tested.
         camera: A single camera.
-        drawn: The depth that it sees of all Gaussians that may occlude them.
+        drawn: Depth of all possible occluders in that camera.
     """
     surface = torch.where(drawn.alpha[0] > _SURFACE_ALPHA, drawn.depth[0], torch.inf).numpy()
     pose, intrinsics = camera.camera_from_world[0].numpy(), camera.intrinsics[0].numpy()

@@ -1,9 +1,12 @@
 """Views of an object alone from the cameras of its capture, and its normals from their depth.
 
-The map from Gaussians to pixels, transposed, takes an average of an image over the pixels that each Gaussian covers,
-weighted by how much it contributes to them; hidden Gaussians have no weight. The inverse depth of a plane is linear in
-the pixel, so its gradient, fitted over a small window, is the normal. Every Gaussian takes the mean over its pixels in
-all views; the shape of the surrounding Gaussians decides as far as it is flat, and wherever no camera looks.
+1. Draw the object alone in some cameras (`object_views`).
+2. Fit the gradient of inverse depth in a small window around each pixel. The inverse depth of a plane is linear in the
+   pixel, so the gradient gives the normal (`_normals_of`).
+3. Average the pixels' normals for each Gaussian by the transposed map from Gaussians to pixels. It weights pixels by
+   the Gaussian's contribution, so hidden Gaussians get no weight.
+4. Add the normals from the neighbours' shapes, weighted by their confidence (`fuse_normals`). They alone give the
+   normals of Gaussians that no camera sees.
 """
 
 import math
@@ -19,13 +22,8 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.normals import Normals
 from splatgraft.rendering import ViewOperator, view_operator
 
-# number and size of the views
 _MAX_VIEWS = 16  # cameras, spread over the capture
-_PIXELS = 2.0
-"""Width of a view in pixels, per square root of the number of Gaussians: a Gaussian in front then covers a few."""
-_MIN_WIDTH = 48  # pixels
-_MAX_WIDTH = 128  # pixels; bounds the time
-_FILLED = 0.95  # share of the width that the bounding sphere fills
+_MIN_WIDTH, _MAX_WIDTH = 48, 128  # pixels of a view; the larger one bounds the time
 
 
 @dataclass(frozen=True)
@@ -33,20 +31,23 @@ class ObjectView:
     """One view of an object of n Gaussians."""
 
     camera: Cameras
-    """A single one, of the cut image."""
+    """A single camera, with an image cut to the object."""
     operator: ViewOperator
-    """The view's linear map for the object alone."""
+    """Linear map from values of the object's Gaussians to pixels."""
     directions: Float[Tensor, "n 3"]
     """Unit, from the camera to each Gaussian."""
 
 
 def object_views(gaussians: Gaussians, sphere: BoundingSphere, cameras: Cameras) -> tuple[ObjectView, ...]:
-    """Views of an object from some of the cameras that have its middle in their image.
+    """Draw views of an object from cameras that have its middle in their image.
 
     Args:
         gaussians: The n Gaussians of the object.
-        sphere: Their bounding sphere.
-        cameras: Of the capture, in the same frame.
+        sphere: The object's bounding sphere.
+        cameras: Cameras of the capture, in the same frame.
+
+    Returns:
+        At most 16 views.
     """
     if gaussians.count == 0:
         return ()
@@ -57,21 +58,21 @@ def object_views(gaussians: Gaussians, sphere: BoundingSphere, cameras: Cameras)
     at_px = center[:, :2] / depth[:, None].clamp_min(1e-9) * focal + cameras.intrinsics[:, :2, 2]
     inside = (at_px >= 0).all(1) & (at_px < cameras.sizes).all(1)
     chosen = cameras[(depth > sphere.radius) & inside].spread(_MAX_VIEWS)
-    wanted = round(_PIXELS * math.sqrt(gaussians.count))
+    wanted = round(2 * math.sqrt(gaussians.count))  # a Gaussian in front covers a few pixels
     width = min(max(wanted, _MIN_WIDTH), _MAX_WIDTH)
     views = []
     for camera in chosen:
-        cut = _cut(camera, sphere, width, _FILLED)
+        cut = _cut(camera, sphere, width)
         directions = torch.nn.functional.normalize(gaussians.means - cut.centers[0], dim=1)
         views.append(ObjectView(cut, view_operator(gaussians, cut), directions))
     return tuple(views)
 
 
-def _cut(camera: Cameras, sphere: BoundingSphere, width: int, filled: float) -> Cameras:
-    """The camera with a square image that the sphere fills."""
+def _cut(camera: Cameras, sphere: BoundingSphere, width: int) -> Cameras:
+    """Cut a camera to a square image; the sphere fills 95% of its width."""
     pose = camera.camera_from_world[0]
     x, y, z = (pose[:3, :3] @ sphere.center + pose[:3, 3]).tolist()
-    focal = filled * 0.5 * width * z / sphere.radius
+    focal = 0.95 * 0.5 * width * z / sphere.radius
     middle = 0.5 * width
     intrinsics = torch.tensor([[focal, 0, middle - focal * x / z], [0, focal, middle - focal * y / z], [0, 0, 1]])
     return Cameras(
@@ -84,29 +85,30 @@ def _cut(camera: Cameras, sphere: BoundingSphere, width: int, filled: float) -> 
 
 _normalize = torch.nn.functional.normalize
 
-# how depth becomes normals; chosen on eight scenes with true normals, flat around these values
+# normals from depth; chosen on eight scenes with true normals, flat around these values
 _REACH = 2  # pixels from the middle of the fitted window to its edge; the best of 1, 2, 3
 _WINDOW = 1.4  # pixels; standard deviation of the window's weights
-_SAME_SURFACE = 0.1  # radii of the object; standard deviation of depth within a window, so that edges are not bridged
-_COVERED = 0.5  # A pixel of at least this alpha shows the object
-_MIN_FILLED = 0.3  # share of the window's weight that must lie on the object
-_MIN_PIXELS = 0.5  # pixels that a Gaussian covers in all views together, where depth and neighbours count alike
+_SAME_SURFACE = 0.1  # object radii; standard deviation of depth in a window, against windows across an edge
+_COVERED = 0.5  # smallest alpha of a pixel that shows the object
+_MIN_FILLED = 0.3  # smallest share of the window's weight on the object
+_MIN_PIXELS = 0.5  # pixels of a Gaussian in all views together at which the weight of its depth is half
 _NEIGHBOURS = 2.0
-"""Weight of the neighbours' normal times the third power of its confidence, beside the depth's of 1: on a smooth
-surface more of them average more noise (5.0 degrees instead of 7.5), near edges they mislead."""
+"""Weight of the neighbours' normal of confidence 1, which falls with the third power; the weight of depth is 1.
+
+On a smooth surface a larger weight averages more noise (5.0 degrees instead of 7.5); near edges it misleads."""
 
 
 def fuse_normals(gaussians: Gaussians, views: tuple[ObjectView, ...], neighbours: Normals, *, radius: float) -> Normals:
-    """Normals from depth images and neighbours together.
+    """Fuse normals from depth images with normals from neighbours.
 
     Args:
         gaussians: The n Gaussians of an object.
-        views: Of the object alone.
-        neighbours: Estimate from the Gaussians' own shapes; returned as it is where there are no views.
-        radius: Of the object, world units.
+        views: Views of the object alone; without any, `neighbours` is the result.
+        neighbours: Estimate from the Gaussians' own shapes.
+        radius: Radius of the object, world units.
 
     Returns:
-        Normals, of which `confidence` is the agreement of both, in [0, 1].
+        Normals, with the agreement of both estimates as confidence, in [0, 1].
     """
     total = torch.zeros(gaussians.count, 4)
     for view in views:
@@ -126,7 +128,7 @@ def fuse_normals(gaussians: Gaussians, views: tuple[ObjectView, ...], neighbours
 
 
 def _inverse_depth(gaussians: Gaussians, view: ObjectView) -> Float[Tensor, "h w"]:
-    """Mean inverse depth given a hit; 0 where the object is not."""
+    """Draw the mean inverse depth of the object; 0 in pixels beside it."""
     pose = view.camera.camera_from_world[0]
     depth = (gaussians.means @ pose[:3, :3].T + pose[:3, 3])[:, 2:3]
     alpha = view.operator.alpha
@@ -137,7 +139,7 @@ def _inverse_depth(gaussians: Gaussians, view: ObjectView) -> Float[Tensor, "h w
 def _normals_of(
     inverse: Float[Tensor, "h w"], view: ObjectView, radius: float
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
-    """World normals towards the camera by weighted least squares over windows, and their weight: cosine to the view."""
+    """Fit world normals towards the camera by weighted least squares over windows, with the view's cosine as weight."""
     h, w = inverse.shape
     reach = _REACH
     steps = torch.arange(-reach, reach + 1.0)

@@ -1,7 +1,9 @@
-"""A placed object prepared for the light at its new place: normals, shadow maps, self-visibility, and its old light.
+"""Preparation of a placed object for the light at its new place.
 
-All of it moves with the object (`PreparedObject.moved`); it is made again after a rotation, a change of scale, or with
-other light sources.
+1. Find the light in the object's capture (`find_source_light`).
+2. Estimate normals, splat shadow maps, and compute self-visibility and materials (`prepare_object`).
+3. Move the results with the object (`PreparedObject.moved`). They are computed again after a rotation, a change of
+   scale, or a change of the light sources.
 """
 
 from dataclasses import dataclass, replace
@@ -29,24 +31,22 @@ from splatgraft.relighting.shading import irradiance
 from splatgraft.relighting.shadows.scene_ratio import ObjectShadowMaps, object_shadow_maps, self_visibility
 from splatgraft.runtime.note import Note
 
-_MIN_GLOSS = 0.03  # share of the object; less gloss is not reported
-
 SourceLight = Light | EstimatedLight | NoLight | None
-"""The light that an object was captured in: given, estimated, none, or None without a source scene."""
+"""Light that an object was captured in: given, estimated, none found, or None without a source scene."""
 
 
 @dataclass(frozen=True)
 class SourceScene:
-    """The capture that an object comes from, without the object."""
+    """The capture that an object comes from, without the object; all in the object's own frame."""
 
     gaussians: Gaussians
-    """In the object's own frame."""
+    """Gaussians of the scene."""
     cameras: Cameras
-    """Cameras of the capture, in the same frame."""
+    """Cameras of the capture."""
     light: Light | None = None
-    """At the object's place, in the same frame, where it is known; otherwise it is estimated."""
+    """Known light at the object's place; None to estimate it."""
     normals: Float[Tensor, "n 3"] | None = None
-    """Unit, of the object's Gaussians, outward, in the same frame, where they are known; otherwise estimated."""
+    """Known normals of the object's Gaussians, unit, outward; None to estimate them."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class SourceLighting:
     """The light that an object of n Gaussians was captured in."""
 
     light: Light
-    """Target's frame."""
+    """The light, target's frame."""
     irradiance: Float[Tensor, "n 3"]
-    """Linear rgb on each Gaussian under that light."""
+    """Linear rgb irradiance on each Gaussian under that light."""
     materials: Materials
-    """What of the object's colours is matt and what is gloss, in units of that light."""
+    """Matt and glossy parts of the object's colours, in units of that light."""
     estimate: EstimatedLight | None
-    """What the light rests on, source's frame; None where it was given."""
+    """Evidence for the light, source's frame; None if the light was given."""
 
 
 @dataclass(frozen=True)
@@ -70,29 +70,29 @@ class PreparedObject:
     number: int
     """Number of the object among all placed ones, from 1."""
     gaussians: Gaussians
-    """Target's frame."""
+    """The object's Gaussians, target's frame."""
     target_from_object: Similarity
-    """The placement."""
+    """Placement of the object."""
     sphere: BoundingSphere
     """Bounding sphere of the Gaussians."""
     normals: Normals
     """Normals of the Gaussians."""
     light_sources: tuple[LightSource, ...]
-    """Sources of the light at the new place, for which the maps are."""
+    """Sources of the light at the new place."""
     maps: ObjectShadowMaps
-    """For the samples of the light at the new place."""
+    """Shadow maps for the samples of the light at the new place."""
     self_visibility: Float[Tensor, "n k"]
     """Share of every sample of the new light that the object lets through to its own Gaussians, in [0, 1]."""
     source_lighting: SourceLighting | None
-    """None where it is not known."""
+    """Old light of the object; None if it is unknown."""
     notes: tuple[Note, ...]
-    """The light it was captured in, or why that is not known."""
+    """Description of the old light, or the reason why it is unknown."""
 
     def moved(self, placed: PlacedObject, light: Light) -> "PreparedObject | None":
-        """The object translated to where `placed` has it, under other ambient light.
+        """Translate the object to the place in `placed`, under other ambient light.
 
         Returns:
-            None where it was rotated or scaled, too, or the light has other sources.
+            The moved object; None if it was rotated or scaled, too, or if the light has other sources.
         """
         old, new = self.target_from_object, placed.target_from_object
         if light.sources != self.light_sources or new.scale != old.scale or not torch.equal(new.rotation, old.rotation):
@@ -115,9 +115,9 @@ class PreparedObject:
 
 
 def find_source_light(object_gaussians: Gaussians, source: SourceScene | None) -> SourceLight:
-    """The light that an object was captured in, in the frame of its source scene: as given there, or estimated.
+    """Return the light that an object was captured in, in its source's frame: the given one, or an estimate.
 
-    The object's shading and its shadow in its capture are evidence, too.
+    The object's own shading and shadow in its capture are evidence, too.
     """
     if source is None:
         return None
@@ -140,18 +140,18 @@ def prepare_object(
 
     Args:
         placed: Object and placement.
-        source: The scene it was taken from; None where not known.
-        cameras: Of the target's capture.
-        source_light: What `find_source_light` gives.
-        light: At the new place.
-        number: Of the object among all placed ones, from 1.
+        source: The scene that the object was taken from; None if unknown.
+        cameras: Cameras of the target's capture.
+        source_light: Result of `find_source_light`.
+        light: The light at the new place.
+        number: Number of the object among all placed ones, from 1.
 
     Raises:
-        ValueError: The source gives normals, and not one for each of the object's Gaussians.
+        ValueError: The source gives another number of normals than the object has Gaussians.
     """
     gaussians = placed.in_target()
     sphere = bounding_sphere(gaussians)
-    # the object is seen best from where it was captured
+    # the capture's own cameras see the object best
     seen_from = cameras if source is None else placed.target_from_object.cameras(source.cameras)
     views = object_views(gaussians, sphere, seen_from)
     normals = _normals(placed, source, gaussians, seen_from, views)
@@ -159,7 +159,7 @@ def prepare_object(
     maps = object_shadow_maps(gaussians, sphere, samples)
     lighting, notes = None, []
     if isinstance(source_light, NoLight):
-        notes.append(Note(f"Where object {number} comes from: {source_light.reason}"))
+        notes.append(Note(f"At the old place of object {number}: {source_light.reason}"))
     elif source is not None and source_light is not None:
         estimate = source_light if isinstance(source_light, EstimatedLight) else None
         old = source_light.light if isinstance(source_light, EstimatedLight) else source_light
@@ -170,9 +170,9 @@ def prepare_object(
         received = irradiance(old_samples, normals.vectors, sample_visibility=shares)
         materials = estimate_materials(gaussians, normals.vectors, views, reflected_light(old, old_samples, shares))
         lighting = SourceLighting(old, received, materials, estimate)
-        notes.append(Note(f"Where object {number} comes from: {described}{_gloss_note(materials, gaussians)}"))
+        notes.append(Note(f"At the old place of object {number}: {described}{_gloss_note(materials, gaussians)}"))
     if lighting is None:
-        unknown = f"The light that object {number} had is not known: it keeps its mean brightness."
+        unknown = f"The old light of object {number} is unknown: the object keeps its mean brightness."
         notes.append(Note(unknown, "warning"))
     return PreparedObject(
         number=number,
@@ -189,13 +189,13 @@ def prepare_object(
 
 
 def _gloss_note(materials: Materials, gaussians: Gaussians) -> str:
-    """A sentence on what was found glossy; empty where nothing was."""
+    """Describe the object's gloss in a sentence; empty below 3 percent."""
     size = gaussians.opacities * gaussians.scales.sort(1).values[:, 1:].prod(1)
     share = float((size * materials.share).sum() / size.sum())
     mirrors = float((size * materials.mirrors).sum() / size.sum())
-    note = f" {100 * share:.0f}% of what the object showed was gloss." if share > _MIN_GLOSS else ""
-    if mirrors > _MIN_GLOSS:
-        note += f" {100 * mirrors:.0f}% of it is a mirror, whose reflections are only blurred."
+    note = f" {100 * share:.0f}% of the light from the object was gloss." if share > 0.03 else ""
+    if mirrors > 0.03:
+        note += f" {100 * mirrors:.0f}% of its surface is a mirror, whose reflections are only blurred."
     return note
 
 
@@ -206,7 +206,7 @@ def _normals(
     cameras: Cameras,
     views: tuple[ObjectView, ...],
 ) -> Normals:
-    """The object's normals in the target's frame: those that the source gives, or an estimate."""
+    """Return the object's normals in the target's frame: the source's, or an estimate."""
     if source is None or source.normals is None:
         neighbours = estimate_normals(in_target, cameras)
         return fuse_normals(in_target, views, neighbours, radius=bounding_sphere(in_target).radius)

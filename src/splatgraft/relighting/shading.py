@@ -1,7 +1,7 @@
 """Irradiance of Gaussians under light samples, ratios of two lights' irradiance, and their application to colours.
 
-The ratio's variation over the object is applied in full; of its mean only a stated share is (ratio images, Debevec
-1998).
+Colours are multiplied by the ratio of new to old irradiance (differential rendering, Debevec 1998). Its variation over
+the object is applied in full, but its mean only by the shares in `ShadeSettings`.
 """
 
 import math
@@ -22,26 +22,28 @@ class ShadeSettings:
     """Limits of the shading ratio."""
 
     span: float = 5.0
-    """Most factor by which a Gaussian's ratio may differ from the object's mean ratio; set by hand."""
+    """Largest factor between a Gaussian's ratio and the object's mean ratio; set by hand."""
     floor: float = 0.08
-    """Share of the mean irradiance that is added to all: interreflections that no sample follows; set by hand."""
+    """Share of the mean irradiance that is added to all: interreflections that no sample represents; set by hand."""
     level_share: float = 0.4
-    """Share, in [0, 1], of the mean's gray part (in logarithms) that is applied, as each capture may have been exposed
-    for its own light and the estimated level is uncertain. Chosen by benchmarks/fit_shading.py on scenes that the
-    light's numbers were not fitted to: there 0.2 to 0.4 are best, and what the light's own training scenes say is too
-    much."""
+    """Share of the mean's gray part (in logarithms) that is applied, in [0, 1].
+
+    It is below 1 because each capture may have been exposed for its own light, and the estimated level is uncertain.
+    Chosen by benchmarks/fit_shading.py on scenes that the light was not fitted to: 0.2 to 0.4 are best there. The
+    light's own training scenes ask for too much."""
     tint_share: float = 0.25
-    """Share, in [0, 1], of the mean's tint that is applied: where the old light's tint is found wrong, an object turns
-    violet or blue. Chosen on 19 scenes that the light's numbers were not fitted to: 0 and 0.25 are alike, 1 worse."""
+    """Share of the mean's tint that is applied, in [0, 1].
+
+    It is small because an object turns violet or blue if the old light's tint is estimated wrongly. Chosen on 19 scenes
+    that the light was not fitted to: 0 and 0.25 are equally good, 1 is worse."""
 
 
-_UNKNOWN_SHARE = 0.5  # share of the new light's variation that an object of unknown source light takes on; set by hand
 KNOWN_LIGHTS = ShadeSettings(level_share=1.0, tint_share=1.0)
-"""Where both lights were given: nothing is uncertain."""
+"""Settings for two given lights, which are certain."""
 
 
 def soft_cosine(cosine: Float[Tensor, "n k"], softness: Float[Tensor, "k"]) -> Float[Tensor, "n k"]:
-    """Mean of max(0, cos) over a cone of radius `softness`, radians, approximated by a quadratic."""
+    """Compute the mean of max(0, cos) over a cone of radius `softness`, radians, approximated by a quadratic."""
     edge = torch.sin(softness.clamp_max(math.pi / 2))
     return torch.where(cosine >= edge, cosine, ((cosine + edge).clamp_min(0)) ** 2 / (4 * edge))
 
@@ -49,11 +51,11 @@ def soft_cosine(cosine: Float[Tensor, "n k"], softness: Float[Tensor, "k"]) -> F
 def irradiance(
     samples: LightSamples, normals: Float[Tensor, "n 3"], *, sample_visibility: Float[Tensor, "n k"]
 ) -> Float[Tensor, "n 3"]:
-    """Linear rgb irradiance on surfaces with unit `normals`.
+    """Compute linear rgb irradiance on surfaces.
 
     Args:
         samples: The k samples of a light.
-        normals: Unit.
+        normals: Unit normals of the surfaces.
         sample_visibility: Share of every sample that reaches each surface, in [0, 1].
     """
     soft = soft_cosine(normals @ samples.directions.T, samples.softness)
@@ -67,9 +69,9 @@ def shade_ratio(
     *,
     settings: ShadeSettings = ShadeSettings(),
 ) -> Float[Tensor, "n 3"]:
-    """Factor on an object's linear colours: irradiance at the new place over irradiance at the old one.
+    """Compute the factor on an object's linear colours: irradiance at the new place over irradiance at the old one.
 
-    Floored, and limited around the object's mean. Of the mean itself, a geometric one, the settings' shares are
+    The factor is floored, and limited around the object's geometric mean. The settings' shares of that mean are
     applied.
 
     Args:
@@ -90,13 +92,13 @@ def light_scale(
     *,
     settings: ShadeSettings = ShadeSettings(),
 ) -> Float[Tensor, "3"]:
-    """Factor on the new light after which the mean ratio to the old light has changed by the settings' shares alone.
+    """Compute the factor on the new light that reduces the mean ratio to the old light to the settings' shares.
 
     Args:
         target: Linear irradiance at the new place.
         source: Linear irradiance at the old place.
         opacities: Weights of the means, in [0, 1].
-        settings: Shares.
+        settings: Shares of level and tint.
     """
     log_ratio = (_floored(target, opacities, settings) / _floored(source, opacities, settings)).log()
     mean = _mean(log_ratio, opacities)[0]
@@ -105,14 +107,14 @@ def light_scale(
 
 
 def unknown_origin_ratio(target: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-    """The factor for an object of unknown source light: half of the new light's variation, a mean of 1.
+    """Compute the factor for an object of unknown source light: half of the new light's variation, a mean of 1.
 
     Args:
         target: Linear irradiance at the new place.
         opacities: Weights of the mean, in [0, 1].
     """
     settings = ShadeSettings()
-    log_ratio = _UNKNOWN_SHARE * _floored(target, opacities, settings).log()
+    log_ratio = 0.5 * _floored(target, opacities, settings).log()  # set by hand
     return _limited(log_ratio - _mean(log_ratio, opacities), opacities, settings)
 
 
@@ -130,13 +132,13 @@ def _floored(
 def _limited(
     log_ratio: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], settings: ShadeSettings
 ) -> Float[Tensor, "n 3"]:
-    """The ratio with its variation around the mean limited."""
+    """Limit the variation of a ratio around its mean."""
     mean, span = _mean(log_ratio, opacities), math.log(settings.span)
     return (mean + (log_ratio - mean).clamp(-span, span)).exp()
 
 
 def apply_gain(gaussians: Gaussians, gain: Float[Tensor, "3"] | Float[Tensor, "n 3"]) -> Gaussians:
-    """Gaussians whose linear colour is multiplied by `gain`; bands above 0 to first order around the mean colour.
+    """Multiply the linear colour of Gaussians by `gain`, to first order around the mean colour in bands above 0.
 
     DC' = sRGB(gain * linear(DC)); higher bands are multiplied by the derivative of that curve at DC. A Gaussian whose
     gain is exactly 1 keeps every bit.
@@ -152,8 +154,8 @@ def apply_gain(gaussians: Gaussians, gain: Float[Tensor, "3"] | Float[Tensor, "n
 def _through_linear(
     srgb: Float[Tensor, "n 3"], gain: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """sRGB colours after a gain on linear light, and the derivative by the sRGB colour before."""
-    # the caller may be optimising the gain: this derivative is by the colour alone
+    """Compute sRGB colours after a gain on linear light, and their derivative by the sRGB colours before."""
+    # the derivative is by the colour alone, even if the caller optimises the gain
     with torch.enable_grad():
         point = srgb.detach().requires_grad_()
         lit = srgb_from_linear(linear_from_srgb(point) * gain.detach())

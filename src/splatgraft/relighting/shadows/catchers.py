@@ -1,8 +1,11 @@
-"""Shadow catchers: black Gaussians in a surface that lets light through, which shade what is seen behind it.
+"""Shadow catchers: black Gaussians in a translucent surface, which shade the Gaussians seen behind it.
 
-Fits often draw a plain floor by thin Gaussians before wide ones far behind it, so that a shadow in the colours of the
-surface changes a part of each pixel alone, and is pale. Black Gaussians whose transmittance is the ratio of light with
-the object to that without it do the same to the rest. Where the surface is opaque there are none.
+Reconstructions often draw a plain floor by thin Gaussians in front of wide ones far behind it. A shadow in the thin
+ones' colours changes only a part of each pixel, so it is pale. Black Gaussians shade the rest: their transmittance is
+the ratio of light with the object to light without it.
+
+1. Place catchers at shadowed points of the surface that views show translucent (`_under_surface`).
+2. Correct their depth by the pixels that they cover (`_weighed`), in two rounds.
 """
 
 from collections.abc import Sequence
@@ -24,16 +27,11 @@ from splatgraft.relighting.shadows.scene_ratio import DARKEST, SceneRatio
 from splatgraft.relighting.shadows.surface_views import GAMMA, SurfaceView, blended_values
 
 # set by hand
-_OPAQUE = 0.97  # share of a pixel from which on colours of the surface alone make its shadow
-_AROUND, _UNDER = 16, 1.0
-"""Receivers around a point; how many standard deviations of their height a catcher lies under their mean."""
-_FAINTEST = 0.03  # share of light; where less is lost there are no catchers
+_OPAQUE = 0.97  # share of a pixel; a surface with a larger share needs no catchers
+_AROUND = 16  # receivers around a point; a catcher lies one standard deviation of their heights below their mean
+_FAINTEST = 0.03  # share of light; a shadow that takes less has no catchers
 _WIDTH = 0.6  # standard deviation over the spacing: a square lattice of them is even to a percent
-_FLAT = 0.1  # standard deviation along the normal over that across it
-_REACH = 3.0  # standard deviations within which catchers overlap
-_CLEAREST = 1e-6  # opacity of those without any depth
-_ROUNDS, _MOST = 2, 1.5
-"""How often depths are corrected by what the views show, and the largest factor."""
+_CLEAREST = 1e-6  # opacity of a catcher without depth
 
 
 @dataclass(frozen=True)
@@ -41,42 +39,42 @@ class ShadowCatchers:
     """k black Gaussians."""
 
     clear: Gaussians
-    """Without their depth: invisible; world frame."""
+    """The Gaussians without their depth, so invisible; world frame."""
     depth: Float[Tensor, "k"]
     """Optical depth in the middle of each, -log(1 - opacity), in sRGB."""
     receiver: Int[Tensor, "k"]
-    """Position of the receiver that each is at."""
+    """Position of a receiver beside each catcher."""
 
     @staticmethod
     def none() -> "ShadowCatchers":
-        """No catchers."""
+        """Return no catchers."""
         return ShadowCatchers(empty(), torch.zeros(0), torch.zeros(0, dtype=torch.int64))
 
     @property
     def visible(self) -> Gaussians:
-        """With their depth."""
+        """The Gaussians with their depth."""
         return with_depth(self.clear, self.depth)
 
 
 def with_depth(gaussians: Gaussians, depth: Float[Tensor, "n"]) -> Gaussians:
-    """Gaussians of some optical depth in their middle, instead of their opacity."""
+    """Replace the opacity of Gaussians by an optical depth in their middle."""
     return replace(gaussians, opacity_logits=(1 - torch.exp(-depth)).clamp(_CLEAREST, 1 - _CLEAREST).logit())
 
 
 def find_catchers(
     receivers: Receivers, ratio: SceneRatio, gaussians: Gaussians, views: Sequence[SurfaceView], *, spacing: float
 ) -> ShadowCatchers:
-    """The catchers under a surface, where views show its shadow and something behind it.
+    """Find catchers under a surface, where views show both its shadow and something behind it.
 
     Args:
         receivers: Gaussians of the surface.
-        ratio: Their ratios, at their centres.
+        ratio: Ratios at the receivers' centres.
         gaussians: The scene, receivers first.
-        views: What they show of it.
+        views: Views of the surface.
         spacing: World units between two catchers.
     """
     catchers = _under_surface(receivers, views, spacing=spacing)
-    for _ in range(_ROUNDS if len(catchers.depth) else 0):
+    for _ in range(2 if len(catchers.depth) else 0):
         catchers = _weighed(catchers, ratio, gaussians, views)
     seen = catchers.depth > _CLEAREST
     return ShadowCatchers(catchers.clear.select(seen), catchers.depth[seen], catchers.receiver[seen])
@@ -85,10 +83,10 @@ def find_catchers(
 def _weighed(
     catchers: ShadowCatchers, ratio: SceneRatio, gaussians: Gaussians, views: Sequence[SurfaceView]
 ) -> ShadowCatchers:
-    """Catchers with the part of their depth with which the pixels that they cover are as dark as they must be.
+    """Scale the depth of catchers so that the pixels that they cover become as dark as the ratio demands.
 
-    Some lie before Gaussians of the surface, which have the shadow in their colours already. The mean logarithms of a
-    pixel without the catchers, with them, and as it must be give the part, by the secant.
+    Some catchers lie in front of Gaussians of the surface, whose colours hold the shadow already. The factor follows by
+    the secant from mean logarithms of the pixels without catchers, with catchers, and with the wanted shadow.
     """
     values, black = blended_values(ratio), catchers.visible
     sums = torch.zeros(black.count, 3)
@@ -100,12 +98,12 @@ def _weighed(
         pixels = torch.stack([view.value, shaded, wanted], -1).clamp_min(DARKEST).log() * known
         sums += weights.blend_transpose(pixels)[len(view.which) :]
     without, with_them, wanted = sums.unbind(1)
-    part = ((without - wanted) / (without - with_them).clamp_min(1e-6)).clamp(0, _MOST)
+    part = ((without - wanted) / (without - with_them).clamp_min(1e-6)).clamp(0, 1.5)
     return replace(catchers, depth=part * catchers.depth)
 
 
 def _under_surface(receivers: Receivers, views: Sequence[SurfaceView], *, spacing: float) -> ShadowCatchers:
-    """Catchers as deep as the shadow of the points that the views show, wherever some show something behind them."""
+    """Place catchers as deep as the shadow, one per cell of shadowed surface points that views show translucent."""
     values = [
         torch.cat([v.points, receivers.normals[v.nearest], v.ratio[:, None], v.opaque[:, None]], 1) for v in views
     ]
@@ -121,7 +119,7 @@ def _under_surface(receivers: Receivers, views: Sequence[SurfaceView], *, spacin
     middle = points - _under(points, normals, receivers)[:, None] * normals
     clear = Gaussians(
         means=middle,
-        log_scales=torch.tensor([width, width, _FLAT * width]).log().repeat(len(points), 1),
+        log_scales=torch.tensor([width, width, 0.1 * width]).log().repeat(len(points), 1),
         quaternions=quaternion_from_rotation(frames_along(-normals).transpose(1, 2)),
         opacity_logits=torch.zeros(len(points)),
         sh=dc_from_rgb(torch.zeros(len(points), 3))[:, None],
@@ -131,12 +129,15 @@ def _under_surface(receivers: Receivers, views: Sequence[SurfaceView], *, spacin
 
 
 def _under(points: Float[Tensor, "k 3"], normals: Float[Tensor, "k 3"], receivers: Receivers) -> Float[Tensor, "k"]:
-    """How far under points of the surface most receivers around them are, world units; smooth over the points."""
+    """Compute the depth below surface points at which most receivers around them lie, world units.
+
+    It is averaged over neighbouring points.
+    """
     if not len(points):
         return torch.zeros(0)
 
     def heights(of: Float[Tensor, "r 3"]) -> tuple[Float[Tensor, "k a"], Int[Tensor, "k a"]]:
-        """Those of the nearest over the points' planes, and which they are."""
+        """Compute heights of the nearest positions over the points' planes, and their indices."""
         count = min(_AROUND, len(of))
         near = torch.from_numpy(KDTree(of.numpy()).query(points.numpy(), k=count)[1].astype(np.int64)).reshape(
             -1, count
@@ -144,16 +145,16 @@ def _under(points: Float[Tensor, "k 3"], normals: Float[Tensor, "k 3"], receiver
         return ((of[near] - points[:, None]) * normals[:, None]).sum(-1), near
 
     around, _ = heights(receivers.gaussians.means)
-    lowest = around.mean(1) - _UNDER * around.std(1, correction=0)
+    lowest = around.mean(1) - around.std(1, correction=0)
     level, beside = heights(points)
     return -(level + lowest[beside]).mean(1)
 
 
 def _overlapping(points: Float[Tensor, "k 3"], width: float) -> Float[Tensor, "k"]:
-    """How many Gaussians of a width overlap at each one's middle, itself included, by their values there."""
+    """Sum the values of all Gaussians of one width at each one's middle, its own 1 included."""
     if not len(points):
         return torch.ones(0)
     tree = KDTree(points.numpy())
-    near = tree.sparse_distance_matrix(tree, _REACH * width, output_type="coo_matrix")
+    near = tree.sparse_distance_matrix(tree, 3 * width, output_type="coo_matrix")
     value = torch.from_numpy(np.exp(-0.5 * (near.data / width) ** 2)).float()
     return torch.zeros(len(points)).index_add_(0, torch.from_numpy(near.row.astype(np.int64)), value)

@@ -1,13 +1,17 @@
-"""The change that an object makes to the light on the scene around it: shadow and bounce ratios per point.
+"""Shadow and bounce ratios: the change of the light at points of a scene by an object.
 
 Differential rendering (Debevec 1998): the ratio of irradiance with the object to irradiance without it.
+
+1. Splat depth maps from every light sample: of an object (`object_shadow_maps`), of the scene (`scene_shadow_maps`).
+2. Look up visibility: past the scene (`scene_visibility`), past the object itself (`self_visibility`).
+3. Sum the light of all samples with and without the object (`light_sums`), and divide (`ratio_from_sums`).
 """
 
 import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
@@ -27,28 +31,20 @@ from splatgraft.relighting.shadows.shadow_maps import (
 )
 
 # shadow maps of objects and scenes; set by hand
-_SOURCE_SIZE = 512  # pixels, a multiple of 16: width of a map of a source sample; set by hand
+_SOURCE_SIZE = 512  # pixels, a multiple of 16; width of a source sample's map
 AMBIENT_SIZE = 256
-"""Pixels, a multiple of 16: width of a map of an ambient sample; set by hand."""
-_OBJECT_BIAS = (2.0, 1.0)
-"""Pixels, for sources and for ambient light: nearer occluders are the receiver's own surface; set by hand."""
-_SELF_BIAS = (2.5, 2.0)  # the same for an object's shadow on itself
-_SCENE_BIAS = (2.5, 1.5)  # the same for the scene's shadow on itself and on objects
-_SELF_AMBIENT = 1 / 3  # share of an ambient sample that still arrives where the object itself blocks it; set by hand
-_SCENE_AMBIENT = 0.5  # share of an ambient sample that still arrives where the scene blocks it; set by hand
-_BLOCKERS_AROUND = 1.5  # radii of the region within which the scene's Gaussians block light; set by hand
-_MAX_ALBEDO = 0.8
-"""Most albedo of an object: its unlit side is no brighter than the light on it allows, whatever light it was
-captured in; fresh snow and white paint have about this."""
-_NEAREST_SOURCE = 1.5  # object radii; a nearer source counts as this far from the object's middle; set by hand
+"""Width of an ambient sample's map, pixels, a multiple of 16."""
+_OBJECT_BIAS = (2.0, 1.0)  # pixels, for sources and ambient light; nearer occluders are the receiver's own surface
+_SELF_BIAS = (2.5, 2.0)  # pixels, for an object's shadow on itself
+_SCENE_BIAS = (2.5, 1.5)  # pixels, for the scene's shadow on itself and on objects
+_SELF_AMBIENT = 1 / 3  # share of an ambient sample that arrives although the object itself blocks it
+_SCENE_AMBIENT = 0.5  # share of an ambient sample that arrives although the scene blocks it
+_MAX_ALBEDO = 0.8  # limit of an object's bounce under the new light: albedo of fresh snow and white paint
 
 # limits of shadow and bounce; set by hand
-_MIN_CHANGE = 0.004
-"""Share of light; smaller changes become 0, full from three times this on. Half an 8-bit step of a mid grey."""
+_MIN_CHANGE = 0.004  # share of light; half an 8-bit step of a mid grey. Smaller changes become 0
 DARKEST = 0.04
-"""Share of light that every shadow leaves: light that no sample follows; set by hand."""
-_NEAR_REACH = 3.5  # object radii within which ambient shadow and bounce are computed; set by hand
-_WIDEST_CONE = 1.2  # radians; wider cones of a source reach as far aside as this one; set by hand
+"""Smallest share of light in a shadow: indirect light that no sample represents."""
 
 
 @dataclass(frozen=True)
@@ -56,18 +52,18 @@ class ObjectShadowMaps:
     """An object's depth maps from all samples of a light."""
 
     ambient_maps: DepthMaps
-    """One per ambient sample."""
+    """Depth maps, one per ambient sample."""
     occlusions: tuple[tuple[LightSamples, Occlusion, float], ...]
-    """For the sources, if there are any, and for the ambient light: samples, occlusion, and bias in world units."""
+    """Samples, occlusion, and bias in world units: of the sources, if there are any, then of the ambient light."""
 
 
 def object_shadow_maps(gaussians: Gaussians, sphere: BoundingSphere, samples: LightSamples) -> ObjectShadowMaps:
-    """Depth maps of an object, in the target's frame, for every light sample, with its colours for the bounce.
+    """Splat depth maps of an object for every light sample, with its colours for the bounce.
 
     Args:
-        gaussians: The object.
-        sphere: Its bounding sphere, which the maps cover.
-        samples: Of the light at its place.
+        gaussians: The object, target's frame.
+        sphere: The object's bounding sphere, which the maps cover.
+        samples: Samples of the light at the object's place.
     """
     occluders = occluders_of(gaussians)
     sources, ambient = samples.of_sources, samples.of_ambient
@@ -80,8 +76,8 @@ def object_shadow_maps(gaussians: Gaussians, sphere: BoundingSphere, samples: Li
 
     if len(sources):
         both = torch.cat([sources.directions, -sources.directions])
-        nearness = 1 / sources.distances.clamp_min(_NEAREST_SOURCE * sphere.radius)
-        # from a near light the sphere's rim is seen farther out than its radius
+        nearness = 1 / sources.distances.clamp_min(1.5 * sphere.radius)  # a nearer source counts as this far
+        # seen from a near light, the sphere's rim lies farther out than its radius
         rim = sphere.radius / math.sqrt(1 - (float(nearness.max()) * sphere.radius) ** 2)
         window = Window(sphere.center, rim, frames_along(both), torch.cat([nearness, -nearness]))
         maps = splat_depth_maps(occluders, window, size=_SOURCE_SIZE, with_color=True)
@@ -100,13 +96,13 @@ def object_shadow_maps(gaussians: Gaussians, sphere: BoundingSphere, samples: Li
 def self_visibility(
     maps: ObjectShadowMaps, gaussians: Gaussians, normals: Float[Tensor, "m 3"], samples: LightSamples
 ) -> Float[Tensor, "m k"]:
-    """Visibility of every light sample from an object's own Gaussians, past the object itself.
+    """Look up the visibility of every light sample from an object's own Gaussians, past the object itself.
 
     Args:
-        maps: The object's.
+        maps: The object's shadow maps.
         gaussians: The m Gaussians that receive light.
-        normals: Unit, of their surfaces.
-        samples: k samples, of the light that the maps were made for or of another one: maps of sources are made anew.
+        normals: Unit normals of their surfaces.
+        samples: k samples of any light, because maps of its sources are made anew here.
 
     Returns:
         Share of each sample that arrives, in [0, 1].
@@ -125,26 +121,26 @@ def self_visibility(
 
 @dataclass(frozen=True)
 class SceneShadowMaps:
-    """The scene's own depth maps around a place; they stay valid while objects move there."""
+    """Depth maps of the scene around a place; they stay valid while objects move there."""
 
     region: BoundingSphere
-    """What the maps cover."""
+    """The sphere that the maps cover."""
     source_maps: DepthMaps | None
-    """One per source sample; None for a light without sources."""
+    """Depth maps, one per source sample; None for a light without sources."""
     ambient_maps: DepthMaps
-    """One per ambient sample."""
+    """Depth maps, one per ambient sample."""
 
 
 def scene_shadow_maps(scene: Gaussians, region: BoundingSphere, samples: LightSamples) -> SceneShadowMaps:
-    """Depth maps of `scene` for every light sample. Only Gaussians in or near `region` block light."""
+    """Splat depth maps of `scene` for every light sample; only Gaussians in or near `region` block light."""
     maps: list[DepthMaps | None] = []
-    reach = _BLOCKERS_AROUND * region.radius + 3 * scene.scales.max(1).values
+    reach = 1.5 * region.radius + 3 * scene.scales.max(1).values
     blockers = scene.select((scene.means - region.center).norm(dim=1) < reach)
     sizes = (_SOURCE_SIZE, AMBIENT_SIZE)
     for part, size in zip((samples.of_sources, samples.of_ambient), sizes, strict=True):
         window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
         nearest = -torch.tensor(part.blockers_within).clamp_max(region.radius)
-        # Gaussians finer than a pixel of the map add no detail: a random part of them is enough
+        # Gaussians finer than a pixel of the map add no detail, so a random part of them is enough
         occluders = occluders_of(thinned(blockers, width=2 * region.radius / size))
         splatted = splat_depth_maps(occluders, window, size=size, with_color=False, nearest=nearest)
         maps.append(splatted if len(part) else None)
@@ -156,12 +152,14 @@ def scene_shadow_maps(scene: Gaussians, region: BoundingSphere, samples: LightSa
 def scene_visibility(
     maps: SceneShadowMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]
 ) -> Float[Tensor, "m k"]:
-    """Visibility of every light sample from `points` past the scene, so that existing shadows are not darkened twice.
+    """Look up the visibility of every light sample from `points` past the scene.
+
+    With it, an object does not darken the scene's existing shadows again.
 
     Args:
-        maps: The scene's, for k samples.
+        maps: The scene's shadow maps for k samples.
         points: World units.
-        normals: Unit, of the surface at each point.
+        normals: Unit normals of the surface at each point.
 
     Returns:
         Share of each sample that arrives, in [0, 1].
@@ -177,17 +175,29 @@ def scene_visibility(
 
 @dataclass(frozen=True)
 class SceneRatio:
-    """Per receiver, the change that an object makes to the light on it."""
+    """Change of the light on m receivers by an object."""
 
     shadow: Float[Tensor, "m 3"]
-    """Share of linear light that is left, in (0, 1]; exactly 1 out of reach."""
+    """Share of linear light that the object leaves, in (0, 1]; exactly 1 out of reach."""
     bounce: Float[Tensor, "m 3"]
-    """Light from the object, as a share of the light without it."""
+    """Light reflected by the object over the light without it."""
     slope: Float[Tensor, "m 3"]
-    """View dependence of both, world axes: seen along the unit vector d, slope . d is added (grey)."""
+    """View dependence, world axes: slope . d is added to both in all channels for the unit view direction d."""
+
+    def select(self, which: Tensor) -> "SceneRatio":
+        """Select receivers by a mask or by indices."""
+        return SceneRatio(shadow=self.shadow[which], bounce=self.bounce[which], slope=self.slope[which])
+
+    def with_rows(self, rows: Int[Tensor, "r"], ratio: "SceneRatio") -> "SceneRatio":
+        """Replace the ratios of r receivers."""
+        return SceneRatio(
+            shadow=self.shadow.index_copy(0, rows, ratio.shadow),
+            bounce=self.bounce.index_copy(0, rows, ratio.bounce),
+            slope=self.slope.index_copy(0, rows, ratio.slope),
+        )
 
     def strengthened(self, power: float) -> "SceneRatio":
-        """With `power` times the logarithm of every shadow."""
+        """Multiply the logarithm of every shadow by `power`."""
         grey = self.shadow.mean(1, keepdim=True)
         return SceneRatio(self.shadow**power, self.bounce, power * grey ** (power - 1) * self.slope)
 
@@ -199,16 +209,16 @@ def scene_ratio(
     *,
     sample_visibility: Float[Tensor, "m k"],
 ) -> SceneRatio:
-    """Shadow and bounce of an object on a surface.
+    """Compute shadow and bounce of an object on a surface.
 
     Args:
-        maps: The object's.
+        maps: The object's shadow maps.
         points: World units.
-        normals: Unit, of the surface at each point.
+        normals: Unit normals of the surface at each point.
         sample_visibility: Share of each light sample that the scene lets through, in [0, 1].
 
     Returns:
-        The ratios at `points`, with a slope of 0.
+        Ratios at `points`, with a slope of 0.
     """
     sums = (light_sums(maps, points, normals, sample_visibility=sample_visibility, sources=f) for f in (True, False))
     return ratio_from_sums(sum(sums, torch.zeros(3, len(points), 3)))
@@ -222,7 +232,18 @@ def light_sums(
     sample_visibility: Float[Tensor, "m k"],
     sources: bool,
 ) -> Float[Tensor, "3 m 3"]:
-    """Irradiance at `points` without the object, with it, and by its bounce: of the sources or of the ambient light."""
+    """Sum the irradiance at `points` by the sources or by the ambient light.
+
+    Args:
+        maps: The object's shadow maps.
+        points: World units.
+        normals: Unit normals of the surface at each point.
+        sample_visibility: Share of each light sample that the scene lets through, in [0, 1].
+        sources: True for the sources, False for the ambient light.
+
+    Returns:
+        Linear rgb irradiance without the object, with it, and by its bounce.
+    """
     total, column = torch.zeros(3, len(points), 3), 0
     for part, occlusion, bias in maps.occlusions:
         share = sample_visibility[:, column : column + len(part)].contiguous()
@@ -234,7 +255,7 @@ def light_sums(
 
 
 def ratio_from_sums(sums: Float[Tensor, "3 m 3"]) -> SceneRatio:
-    """Ratios from such sums of all light, limited and with small changes set to 0; the slope is 0."""
+    """Compute ratios from the sums of all light (`light_sums`), limited and without small changes; the slope is 0."""
     without, with_object, bounce = sums
     total = without.clamp_min(1e-9)
     # an unlit point cannot get darker
@@ -245,7 +266,7 @@ def ratio_from_sums(sums: Float[Tensor, "3 m 3"]) -> SceneRatio:
 
 
 def _soft_threshold(change: Float[Tensor, "m 3"], least: float) -> Float[Tensor, "m 3"]:
-    """`change` with values below `least` set to exactly 0, without a step: unchanged from three times `least` on."""
+    """Set changes below `least` to exactly 0, and fade them in up to three times `least`."""
     strongest = change.max(1, keepdim=True).values
     return change * ((strongest - least) / (2 * least)).clamp(0, 1)
 
@@ -258,24 +279,24 @@ def reachable(
     farthest: float,
     rims: Float[Tensor, "m"] | float = 0.0,
 ) -> Bool[Tensor, "m"]:
-    """Points whose light an object may change: those near it, and those in the shadow cone of a source.
+    """Select points whose light an object may change: those near it, and those in the shadow cone of a source.
 
     Args:
         points: World units.
         sphere: The object's bounding sphere.
-        samples: Of the light.
+        samples: Samples of the light.
         farthest: World units from the object; no point beyond is reached.
-        rims: World units; extent of what lies around each point.
+        rims: Extent of the Gaussian around each point, world units.
     """
     away = points - sphere.center
     distance = away.norm(dim=1)
-    near = distance - rims < _NEAR_REACH * sphere.radius
+    near = distance - rims < 3.5 * sphere.radius  # reach of ambient shadow and bounce; set by hand
     parts = zip(samples.directions, samples.softness, samples.is_source, samples.distances, strict=True)
     for direction, softness, source, light_distance in parts:
         if source:
             along = -(away @ direction)
             aside = (distance**2 - along**2).clamp_min(0).sqrt()
-            spread = torch.tan(softness.clamp_max(_WIDEST_CONE)) * (along + sphere.radius).clamp_min(0)
+            spread = torch.tan(softness.clamp_max(1.2)) * (along + sphere.radius).clamp_min(0)
             # the shadow of a near light widens with the distance
             wider = 1 + along.clamp_min(0) / (light_distance - sphere.radius).clamp_min(0.5 * sphere.radius)
             near |= (along + rims > -sphere.radius) & (aside - rims < wider * (sphere.radius + spread))

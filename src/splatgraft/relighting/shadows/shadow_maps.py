@@ -1,6 +1,7 @@
-"""Shadow maps: depth maps splatted from Gaussians along many directions, and visibility from them.
+"""Shadow maps: depth maps splatted from Gaussians along many directions, and visibility of points from them.
 
-Visibility by percentage-closer filtering (Reeves et al. 1987) with an offset along the normal.
+Splats follow EWA (Zwicker et al. 2001). Visibility is percentage-closer filtering (Reeves et al. 1987) with an offset
+along the normal.
 """
 
 import math
@@ -20,19 +21,19 @@ from splatgraft.rendering.cpu_simd import LANES, lanes, largest, load, smaller, 
 from splatgraft.runtime.kernels import kernel, serialized
 
 FAR = np.float32(1e30)
-"""Depth of a texel where less than half of the light is blocked."""
+"""Depth of a texel that blocks less than half of the light."""
 
 # compiled into the kernels; all set by hand
 _BINS = 4096  # depth bins of the counting sort
 _FAINTEST = np.float32(0.01)  # alpha below which a splat is cut off
 _CUTOFF = np.float32(3.04)  # standard deviations, where a splat of opacity 1 falls to `_FAINTEST`
 _SPENT = np.float32(0.02)  # transmittance below which a tile of pixels is finished
-_HALF = np.float32(0.5)  # transmittance at which a texel's first depth is taken
+_HALF = np.float32(0.5)  # transmittance at which a texel takes its first depth
 _MAX_ALPHA = np.float32(0.99)  # largest alpha of one splat in one pixel, as in 3DGS
 _DILATION = np.float32(0.15)  # pixels squared, added to the variance of a splat's footprint against aliasing
 _LIFT = np.float32(1.5)  # pixels; a receiver is looked up this far above its surface, along the normal
-_NEAREST_TO_LIGHT = np.float32(0.05)  # share of a near light's distance; occluders nearer to it are left out
-_FLATTEST = np.float32(0.2)  # cosine of incidence below which the slope-dependent bias grows no further
+_NEAREST_TO_LIGHT = np.float32(0.05)  # share of a near light's distance; closer occluders are left out
+_FLATTEST = np.float32(0.2)  # cosine of incidence; flatter light adds no more slope-dependent bias
 
 
 @dataclass(frozen=True)
@@ -40,14 +41,14 @@ class Window:
     """The sphere that depth maps cover, and their k frames."""
 
     center: Float[Tensor, "3"]
-    """World; the middle of every map and depth 0."""
+    """Middle of every map, at depth 0, world units."""
     radius: float
     """Half the width of every map, world units."""
     frames: Float[Tensor, "k 3 3"]
     """Rotations with rows right, down, away from the light: x_in_light = frame @ (x_in_world - center)."""
     nearness: Float[Tensor, "k"] | None = None
-    """One over the light's distance from the centre (perspective maps; negative for a light behind), 0 or None for
-    orthographic ones: (u, v, depth) in the light's frame is seen at (u, v) / (1 + nearness * depth)."""
+    """One over the light's distance from the centre: (u, v, depth) in the light's frame is projected to
+    (u, v) / (1 + nearness * depth). Negative for a light behind; 0 or None for orthographic maps."""
 
     @property
     def directions(self) -> Float[Tensor, "k 3"]:
@@ -57,20 +58,20 @@ class Window:
 
 @dataclass(frozen=True)
 class Occluders:
-    """Gaussians as depth maps need them, computed once for many maps."""
+    """Gaussians as input of depth maps, computed once for many maps."""
 
     means: Float[Tensor, "n 3"]
-    """World units."""
+    """Centres, world units."""
     covariances: Float[Tensor, "n 3 3"]
-    """World units squared."""
+    """Covariances, world units squared."""
     opacities: Float[Tensor, "n"]
-    """In [0, 1]."""
+    """Opacities in [0, 1]."""
     linear_rgb: Float[Tensor, "n 3"]
     """Colour from the zeroth band, linear, in [0, 1]."""
 
 
 def occluders_of(gaussians: Gaussians) -> Occluders:
-    """`gaussians` as occluders."""
+    """Compute occluders from Gaussians."""
     return Occluders(
         means=gaussians.means,
         covariances=gaussians.covariances,
@@ -80,7 +81,7 @@ def occluders_of(gaussians: Gaussians) -> Occluders:
 
 
 def thinned(gaussians: Gaussians, *, width: float) -> Gaussians:
-    """Fewer, wider Gaussians that cover the same area (stochastic simplification, Cook et al. 2007).
+    """Thin Gaussians to fewer, wider ones that cover the same area (stochastic simplification, Cook et al. 2007).
 
     A Gaussian narrower than `width`, world units, is kept with probability (its width / `width`)^2 and grown to
     `width`. The random numbers have a fixed seed.
@@ -94,16 +95,16 @@ def thinned(gaussians: Gaussians, *, width: float) -> Gaussians:
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """Depth maps of some occluders, s x s pixels each, from k directions."""
+    """Depth maps of occluders, s x s pixels each, from k directions."""
 
     window: Window
-    """What the maps cover."""
+    """Sphere and frames of the maps."""
     first: Float[Tensor, "k s s"]
-    """Depth at which half of the light is blocked; 1e30 where less than half is."""
+    """Depth at which half of the light is blocked; 1e30 if less than half is."""
     alpha: Float[Tensor, "k s s"]
     """Share of the light blocked, in [0, 1]."""
     mean: Float[Tensor, "c s s"]
-    """Blended depth of the occluders, 0 where there are none; c = k, or 0 for maps without colour."""
+    """Blended depth of the occluders, 0 in empty pixels; c = k, or 0 for maps without colour."""
     color: Float[Tensor, "c 3 s s"]
     """Blended linear colour of the occluders' side towards the light, over black."""
 
@@ -119,11 +120,11 @@ def splat_depth_maps(
     """Splat depth maps of `occluders`, blended front to back as the renderer does.
 
     Args:
-        occluders: All that may block light.
-        window: What the maps cover, and their directions.
+        occluders: All Gaussians that may block light.
+        window: Sphere that the maps cover, and their frames.
         size: Width of a map, pixels, a multiple of 16.
         with_color: Whether to keep colour and mean depth too.
-        nearest: Per map, world units: occluders of a smaller depth (nearer to the light) are left out.
+        nearest: Smallest depth per map, world units; occluders nearer to the light are left out.
     """
     k = len(window.frames)
     c = k if with_color else 0
@@ -151,13 +152,16 @@ def splat_depth_maps(
 def visibility(
     maps: DepthMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], *, bias: float
 ) -> Float[Tensor, "m k"]:
-    """Visibility of each map's light from points on a surface, in [0, 1]; 1 outside the window.
+    """Look up the visibility of each map's light from points on a surface.
 
     Args:
         maps: k depth maps.
         points: World units.
-        normals: Unit, of the surface at each point.
+        normals: Unit normals of the surface at each point.
         bias: World units; an occluder nearer than this is the surface itself.
+
+    Returns:
+        Share of the light that arrives, in [0, 1]; 1 outside the window.
     """
     out = np.ones((len(points), len(maps.first)), np.float32)
     view = (_array(maps.window.frames), _array(maps.window.center), np.float32(maps.window.radius))
@@ -174,7 +178,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 @kernel(fastmath=True)
 @no_type_check
 def _project(frame, geometry, view, limits, splats):  # noqa: PLR0915  (one kernel: culling, sorting, projection)
-    """Write the splats that touch a map into the rows of `splats`, sorted by depth, and return their number."""
+    """Write the splats that touch a map into rows of `splats`, sorted by depth, and return their number."""
     means, covariances, opacities = geometry
     center, radius, size = view
     nearest, nearness = limits
@@ -214,7 +218,7 @@ def _project(frame, geometry, view, limits, splats):  # noqa: PLR0915  (one kern
         start[b] += 1
         x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         c = covariances[i]
-        # rows of the projection's Jacobian J (EWA, Zwicker et al. 2001); those of F where the light is far
+        # rows of the projection's Jacobian J (EWA, Zwicker et al. 2001); for a distant light the rows of f
         scale = np.float32(1) / (np.float32(1) + nearness * depths[j])
         u = scale * (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z)
         v = scale * (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z)
@@ -247,7 +251,7 @@ def _project(frame, geometry, view, limits, splats):  # noqa: PLR0915  (one kern
 @kernel(fastmath=True, inline="always")
 @no_type_check
 def _blend(splat, at, dv, du, maps):
-    """Blend one splat over a row of pixels; the last value returned is whether all of them are finished."""
+    """Blend one splat over a row of pixels; return weights, weighted depths, and whether all pixels are finished."""
     _, _, depth, ca, cb, cc, su, sv, opacity, _, cut, _ = splat
     near, transmittance = maps
     q = du * (du * ca + np.float32(2) * cb * dv) + cc * dv * dv
@@ -287,7 +291,7 @@ def _splat(geometry, rgb, view, limits, maps, threads):
                 reach = np.sqrt(cut * var_v)
                 for row in range(max(0, int(np.ceil(v - reach - 0.5))), min(size, int(np.floor(v + reach + 0.5)))):
                     dv = np.float32(row) + np.float32(0.5) - v
-                    # where the ellipse q = cut meets the row
+                    # intersection of the ellipse q = cut with the row
                     across = cb * dv
                     root = across * across - ca * (cc * dv * dv - cut)
                     if root <= 0:
@@ -324,7 +328,7 @@ def _filter_visibility(points, normals, view, maps, bias, out):
         for k in range(len(frames)):
             f = frames[k]
             cosine = -(f[2, 0] * normals[i, 0] + f[2, 1] * normals[i, 1] + f[2, 2] * normals[i, 2])
-            # a map pixel on a tilted surface spans tan(angle) of depth; the offset along the normal takes most of it
+            # a map pixel on a tilted surface spans tan(angle) of depth; the offset along the normal covers most of that
             lift = texel * _LIFT
             x = points[i, 0] - center[0] + lift * normals[i, 0]
             y = points[i, 1] - center[1] + lift * normals[i, 1]

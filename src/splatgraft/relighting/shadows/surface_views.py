@@ -1,7 +1,7 @@
-"""What views of a capture show of the surface that the receivers of shadows form: per pixel a point and its light.
+"""Views of the surface under a shadow: for each pixel, the surface point on its ray and the ratio of light there.
 
-A surface is drawn by Gaussians in a layer, blended in the order of their centres, and often lets light through from
-behind. The point of the surface that a pixel shows is where its ray meets the middle of the layer.
+The receivers form the surface: a layer of Gaussians, blended in the order of their centres and often translucent. The
+surface point of a pixel is the intersection of its ray with the middle of the layer.
 """
 
 from collections.abc import Callable
@@ -24,17 +24,16 @@ from splatgraft.rendering import ViewOperator, view_operator
 from splatgraft.runtime.kernels import kernel, serialized
 
 RatioAt = Callable[[Float[Tensor, "p 3"], Float[Tensor, "p 3"], Int[Tensor, "p"]], Float[Tensor, "p"]]
-"""Grey ratio of light at points with unit normals, each on the surface of the receiver whose index is given."""
+"""Function that computes grey ratios of light from p points, their unit normals and the indices of their receivers."""
 
 GAMMA = 2.2
-"""Exponent of sRGB, in which Gaussians are blended, as a power law."""
+"""Exponent of a power law for sRGB, in which Gaussians are blended."""
 
 # set by hand
-_LONGEST_PX = 512  # longest side of a view, cut to the shadow; wider ones are reduced
-_MARGIN = 0.25  # share of its size that a view reaches beyond the shadow on each side
-_CHANGED = 0.05  # change of light from which a receiver or a pixel counts as shadowed; fainter changes are smooth
-_BESIDE_PX = 4  # pixels around a shadowed pixel that count too; pixels from the end of a surface that do not
-_RECEIVING = 0.1  # share of a pixel that receivers must make up, there and around it
+_LONGEST_PX = 512  # longest side of a view after the cut to the shadow; larger ones are reduced
+_CHANGED = 0.05  # share of light; receivers and pixels with a larger change are in shadow, smaller changes are smooth
+_BESIDE_PX = 4  # pixels around a shadowed pixel that are used too; pixels left out along the end of a surface
+_RECEIVING = 0.1  # smallest share of receivers in a used pixel and around it
 
 
 @dataclass(frozen=True)
@@ -42,17 +41,17 @@ class _Surfaces:
     """The surfaces that m receivers form."""
 
     points: Float[Tensor, "m 3"]
-    """The point in the middle of the layer at each of them, world units."""
+    """Point in the middle of the layer at each receiver, world units."""
     normals: Float[Tensor, "m 3"]
-    """Unit."""
+    """Unit normals, world frame."""
     extents: Float[Tensor, "m"]
-    """World units; how far from its point a receiver shows the surface."""
+    """Largest distance from its point at which a receiver shows the surface, world units."""
     tree: KDTree
     """Search tree of the points."""
 
     @staticmethod
     def of(receivers: Receivers) -> "_Surfaces":
-        """The surfaces in the middle of the receivers' layers."""
+        """Find the surfaces in the middle of the receivers' layers."""
         off = ((receivers.gaussians.means - receivers.surface) * receivers.normals).sum(1, keepdim=True)
         points = receivers.gaussians.means - off * receivers.normals
         extents = 3 * receivers.gaussians.scales.max(1).values
@@ -61,7 +60,11 @@ class _Surfaces:
     def hit(
         self, origin: Float[Tensor, "3"], rays: Float[Tensor, "p 3"], near: Float[Tensor, "p 3"]
     ) -> tuple[Float[Tensor, "p 3"], Int[Tensor, "p"], Bool[Tensor, "p"]]:
-        """Where rays meet the plane of the receiver nearest to a guess, that receiver, and whether it is there."""
+        """Intersect rays with the plane of the nearest receiver, starting from guessed points `near`.
+
+        Returns:
+            Points, indices of their receivers, and whether the receiver faces the ray and reaches the point.
+        """
         points, nearest = near, torch.zeros(len(near), dtype=torch.int64)
         facing = torch.zeros(len(near))
         for _ in range(2):
@@ -76,43 +79,43 @@ class _Surfaces:
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """One view, h x w, of the n Gaussians in front of a camera, of which the first m are receivers."""
+    """One view of h x w pixels with n Gaussians in front of the camera; the first m are receivers."""
 
     camera: Cameras
-    """One, cut to the shadow."""
+    """A single camera, cut to the shadow."""
     which: Int[Tensor, "n"]
-    """Positions of the Gaussians, receivers first."""
+    """Positions of the Gaussians in the scene, receivers first."""
     receivers: Int[Tensor, "m"]
-    """Positions of the first m among all receivers."""
+    """Positions of the m receivers among all receivers."""
     drawn_px: Float[Tensor, "n"]
-    """Standard deviations of the Gaussians."""
+    """Largest standard deviations of the Gaussians in the view, pixels."""
     weights: ViewOperator
-    """From values of all these Gaussians to pixels."""
+    """Map from values of the n Gaussians to pixels."""
     value: Float[Tensor, "h w"]
-    """What the receivers' ratios at their centres blend to, in sRGB, with 1 for all other Gaussians."""
+    """Blend of the receivers' ratios at their centres, in sRGB, with 1 for all other Gaussians."""
     mass: Float[Tensor, "h w"]
-    """Share of each pixel that receivers make up."""
+    """Share of receivers in each pixel."""
     shown: Bool[Tensor, "h w"]
-    """The p pixels that show the surface at a shadow or beside one."""
+    """Whether a pixel shows the surface at a shadow or beside one; true for p pixels."""
     points: Float[Tensor, "p 3"]
-    """On the surface, world units."""
+    """Surface points, world units."""
     nearest: Int[Tensor, "p"]
-    """The receiver at each point."""
+    """Index of the receiver at each point."""
     ratio: Float[Tensor, "p"]
-    """Grey ratio of light at the points."""
+    """Grey ratio of light at each point."""
 
     def with_catchers(
         self, gaussians: Gaussians, catchers: Gaussians, values: Float[Tensor, "r"]
     ) -> tuple[ViewOperator, Float[Tensor, "k"], Float[Tensor, "h w"]]:
-        """The view with black Gaussians behind those of the scene in the list.
+        """Draw the view with black Gaussians, which follow those of the scene in the list.
 
         Args:
             gaussians: The scene, receivers first.
-            catchers: The black ones.
-            values: Of the receivers.
+            catchers: Black Gaussians.
+            values: Values of all r receivers.
 
         Returns:
-            From values of all to pixels; the values of all but the receivers; what all values blend to.
+            Map from values of all Gaussians to pixels; the k values after the receivers'; the blend of all values.
         """
         weights = view_operator(concatenate([gaussians.select(self.which), catchers]), self.camera)
         fixed = torch.cat([torch.ones(len(self.which) - len(self.receivers)), torch.zeros(catchers.count)])
@@ -120,26 +123,26 @@ class SurfaceView:
 
     @property
     def opaque(self) -> Float[Tensor, "p"]:
-        """Share of the pixels of the points that receivers make up."""
+        """Share of receivers in the opacity of each point's pixel."""
         return (self.mass / self.weights.alpha.clamp_min(1e-6))[self.shown]
 
 
 def blended_values(ratio: SceneRatio) -> Float[Tensor, "m"]:
-    """What receivers are multiplied by where they are blended: their grey ratios in sRGB."""
+    """Compute the receivers' factors in blending: their grey ratios in sRGB."""
     return (ratio.shadow + ratio.bounce).mean(1).clamp_min(DARKEST) ** (1 / GAMMA)
 
 
 def views_of_surface(
     receivers: Receivers, ratio: SceneRatio, gaussians: Gaussians, cameras: Cameras, *, ratio_at: RatioAt
 ) -> list[SurfaceView]:
-    """What views show of the surface where it is in shadow; those that show nothing of it are left out.
+    """Draw views of the surface in shadow; cameras that do not see the shadow give none.
 
     Args:
         receivers: m Gaussians that an object's shadow may fall on.
-        ratio: Their ratios, at their centres.
+        ratio: Ratios at the receivers' centres.
         gaussians: The scene, receivers first.
-        cameras: The views.
-        ratio_at: The ratio anywhere on the receivers' surfaces.
+        cameras: Cameras of the views.
+        ratio_at: Function that computes the ratio anywhere on the receivers' surfaces.
     """
     grey = (ratio.shadow + ratio.bounce).mean(1)
     shadowed = (1 - grey).abs() > _CHANGED
@@ -157,14 +160,14 @@ def views_of_surface(
 
 
 def _cut_to(camera: Cameras, points: Float[Tensor, "s 3"]) -> Cameras | None:
-    """The camera cut to what it shows of `points`, and reduced; None where it shows nothing of them."""
+    """Cut a camera's image to the points that it sees, and reduce it; None if it sees none."""
     pixels, depth = camera.project(points)
     size = camera.sizes[0].float()
     seen = (depth > 0) & (pixels > 0).all(1) & (pixels < size).all(1)
     if not bool(seen.any()):
         return None
     low, high = pixels[seen].amin(0), pixels[seen].amax(0)
-    margin = _MARGIN * (high - low) + _BESIDE_PX
+    margin = 0.25 * (high - low) + _BESIDE_PX
     low, high = (low - margin).clamp_min(0).floor(), torch.minimum(high + margin, size).ceil()
     window = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
     return camera.cropped([window]).resized(min(1.0, _LONGEST_PX / float((high - low).max())))
@@ -179,7 +182,7 @@ def _view(
     *,
     ratio_at: RatioAt,
 ) -> SurfaceView | None:
-    """What one camera shows of a scene, receivers first; None where it shows no shadow on their surface."""
+    """Draw one camera's view of a scene, receivers first; None if it shows no shadow on their surface."""
     which, drawn_px = gaussians_in_view(scene.means, widths, camera)
     weights = view_operator(scene.select(which), camera)
     receivers = which[: int((which < len(surfaces.points)).sum())]
@@ -201,28 +204,28 @@ def _view(
 
 
 def _widened(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """The largest value around each pixel."""
+    """Take the largest value around each pixel."""
     return F.max_pool2d(values[None], 2 * _BESIDE_PX + 1, 1, _BESIDE_PX)[0]
 
 
 def _rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
-    """Unit directions of the pixels' rays, in the world."""
+    """Compute unit directions of the pixels' rays, world frame."""
     return F.normalize(camera.world_rays(), dim=-1)
 
 
 _REACH = np.float32(3)  # standard deviations by which a Gaussian's centre may lie outside the picture
-_NEAREST = np.float32(1e-6)  # world units; a depth below is taken for this one
+_NEAREST = np.float32(1e-6)  # world units; smallest depth, against division by 0
 
 
 def gaussians_in_view(
     means: Float[Tensor, "n 3"], widths: Float[Tensor, "n"], camera: Cameras
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
-    """Positions of the Gaussians that the camera may show, ascending, and their standard deviations in pixels.
+    """Find the Gaussians that a camera may show: their positions, ascending, and standard deviations in pixels.
 
     Args:
-        means: World units.
+        means: Centres, world units.
         widths: Largest standard deviations, world units.
-        camera: One.
+        camera: A single camera.
     """
     drawn = np.empty(len(means), np.float32)
     pose, intrinsics = (
@@ -238,7 +241,7 @@ def gaussians_in_view(
 @kernel(parallel=True)
 @no_type_check
 def _drawn_widths(means, widths, pose, intrinsics, size, drawn):
-    """Fill `drawn` with standard deviations in pixels; -1 for what lies outside the picture."""
+    """Fill `drawn` with standard deviations in pixels; -1 for Gaussians outside the picture."""
     for i in prange(means.shape[0]):
         x, y, z = means[i, 0], means[i, 1], means[i, 2]
         a = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]

@@ -1,9 +1,9 @@
-"""Shadows fitted in the target's own views: ratios of receivers that draw the ratio of the surface seen in each pixel.
+"""Fit of shadows to views: ratios of receivers whose blend matches the surface's ratio in each pixel.
 
-A surface is drawn by Gaussians in a layer, blended in the order of their centres. From low above it, one that is a
-little too high hides the surface well behind it, so a shadow that is evaluated at the centres is displaced from every
-side, and blurred. Rendering is linear in the Gaussians' values: simultaneous iterative reconstruction (SIRT, Gilbert
-1972) finds a value and a slope over view directions for each Gaussian whose blend is nearest to the true ratio.
+A surface is drawn by Gaussians in a layer, blended in the order of their centres. From a low camera, a Gaussian that
+lies a little too high hides the surface well behind it. A shadow evaluated at the centres is therefore displaced and
+blurred. Rendering is linear in the Gaussians' values, so simultaneous iterative reconstruction (SIRT, Gilbert 1972)
+finds the value of each receiver, and its slope over view directions.
 """
 
 from collections.abc import Sequence
@@ -22,41 +22,45 @@ from splatgraft.rendering import ViewOperator
 # the solver; set by hand
 _ROUNDS = 5  # iterations
 _NARROWEST_PX = 0.5
-"""Widest standard deviation in pixels below which a Gaussian keeps what it has: a reduced view draws it wider than
-it is, and so in the wrong place. Measured on planes: at 0.3 the fit makes shadows worse, at 0.6 better."""
-_RECEIVING = 0.5  # share of a pixel that receivers must make up
-_MAX_SLOPE = 0.9  # most share of a value that a view direction takes away
-_MIN_WEIGHT = 0.05  # pixels; receivers with less weight in all views together keep what they have
+"""Smallest standard deviation of a fitted Gaussian, pixels: a reduced view draws finer ones too wide.
+
+Measured on planes: at 0.3 the fit makes shadows worse, at 0.6 better."""
+_RECEIVING = 0.5  # smallest share of receivers in a pixel that is fitted
+_MAX_SLOPE = 0.9  # largest share of a value that a view direction takes away
+_MIN_WEIGHT = 0.05  # pixels; receivers with less weight in all views together are not fitted
 
 
 @dataclass(frozen=True)
 class _FittedView:
-    """One view of the Gaussians in front of a camera, of which the first m are receivers."""
+    """One view of m receivers and the k other Gaussians in front of a camera."""
 
     which: Int[Tensor, "m"]
-    """Positions of these among all receivers."""
+    """Positions of the m among all receivers."""
     fixed: Float[Tensor, "k"]
-    """Values of the Gaussians after the first m."""
+    """Values of the other Gaussians."""
     weights: ViewOperator
-    """From values of all these Gaussians to pixels."""
+    """Map from values of these Gaussians to pixels, receivers first."""
     target: Float[Tensor, "h w"]
-    """What the values must blend to: where no shadow is near, what they blend to at first."""
+    """Wanted blend of the values; their first blend in pixels away from the shadow."""
     directions: Float[Tensor, "m 3"]
     """Unit, from the camera to each receiver."""
     wide: Bool[Tensor, "m"]
-    """Which receivers the view draws as wide as they are."""
+    """Whether a receiver is wide enough to be drawn at its own width."""
 
 
 def fit_to_views(
     ratio: SceneRatio, gaussians: Gaussians, views: Sequence[SurfaceView], catchers: Gaussians
 ) -> SceneRatio:
-    """Fit the ratios of receivers to what some views show of them.
+    """Fit the ratios of receivers to views of their surface.
 
     Args:
-        ratio: Ratios of the m receivers so far, at their centres; those that no view shows keep them.
+        ratio: Ratios at the centres of the m receivers.
         gaussians: The scene, receivers first.
-        views: Of the surface that they form; none to change nothing.
-        catchers: Black Gaussians that shade what lies behind the receivers.
+        views: Views of the surface; if there are none, the ratios stay.
+        catchers: Black Gaussians that shade the scene behind the receivers.
+
+    Returns:
+        The fitted ratios; receivers that no view shows keep theirs.
     """
     if not views:
         return ratio
@@ -74,7 +78,7 @@ def fit_to_views(
 
 
 def _fitted(view: SurfaceView, values: Float[Tensor, "m"], gaussians: Gaussians, catchers: Gaussians) -> _FittedView:
-    """A view with what its pixels must show past the catchers."""
+    """Compute the wanted blend of a view's pixels with the catchers in place."""
     count = len(view.receivers)
     fixed, weights, target = torch.ones(len(view.which) - count), view.weights, view.value.clone()
     if catchers.count:
@@ -90,7 +94,7 @@ def _fitted(view: SurfaceView, values: Float[Tensor, "m"], gaussians: Gaussians,
 def _solved(
     values: Float[Tensor, "r"], views: Sequence[_FittedView]
 ) -> tuple[Float[Tensor, "r"], Float[Tensor, "r 3"], Bool[Tensor, "r"]]:
-    """Values and slopes of the receivers, and which of these were fitted."""
+    """Solve for values and slopes of the receivers, and return which of them were fitted."""
     slope, weight = torch.zeros(len(values), 3), torch.zeros(len(values))
     wide = torch.zeros(len(values), dtype=torch.bool)
     for view in views:
