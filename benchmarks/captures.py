@@ -28,7 +28,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as cli.py does; read when
 
 import torch
 
-from splatgraft.commands.steps.segment import SOLID_SIDE_PX
 from splatgraft.core.flip import flip
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import fit_color, psnr, ssim
@@ -41,6 +40,7 @@ from splatgraft.reconstruction import ReconstructOptions, reconstruct
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
 from splatgraft.segmentation import SolidifyOptions, segment
+from splatgraft.steps.segment import SOLID_SIDE_PX
 
 EVERY = 8
 FEWEST_PHOTOS = 3

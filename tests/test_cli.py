@@ -2,11 +2,13 @@
 
 import importlib
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from splatgraft.cli import commands, main
+from splatgraft.project.step_table import STEPS, StepRow
 from splatgraft.runtime.optional_dependencies import OPTIONAL_DEPENDENCIES, extra_providing
 
 ROOT = Path(__file__).parents[1]
@@ -21,14 +23,19 @@ def test_help_names_every_command_and_every_command_has_a_step(capsys: pytest.Ca
         assert commands()[command].load()
 
 
-def test_every_file_in_commands_is_a_command() -> None:
-    folder = ROOT / "src" / "splatgraft" / "commands"
-    # what `edit` imports once its page is served, as torch takes seconds, and its child processes
-    parts = {"__init__.py"}
-    files = {path for path in folder.rglob("*.py") if path.name not in parts}
+def test_every_file_in_commands_and_steps_is_a_command() -> None:
+    folders = [ROOT / "src" / "splatgraft" / name for name in ("commands", "steps")]
+    files = {path for folder in folders for path in folder.rglob("*.py") if path.name != "__init__.py"}
     places = [commands()[command].place.partition(":")[0] for command in commands()]
     modules = {Path(importlib.import_module(place).__file__ or "") for place in places if "_paper" not in place}
     assert files == modules
+
+
+@pytest.mark.parametrize("row", STEPS, ids=lambda row: row.command)
+def test_a_row_of_the_table_fits_its_step(row: StepRow) -> None:
+    kind = row.load()
+    assert kind.__name__.lower() == row.command
+    assert set(row.inputs) <= {field.name for field in fields(kind)}
 
 
 def test_a_group_lists_its_commands_and_refuses_others(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,33 +9,26 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any
 
+from splatgraft.project.step_table import STEPS
+
 ENTRY_POINTS = "splatgraft.commands"
 """Group of entry points by which other packages add commands."""
 
 _TABLE = (
-    # command, module in splatgraft.commands, summary
-    ("demo", "demo", "run a whole transfer on captures that come with the package"),
-    ("try", "first_try", "run a whole transfer on two captures of your own, at draft quality"),
-    ("check", "check", "look at photos before time is spent on them"),
-    ("init", "init", "write a commented project.toml for two captures"),
-    ("edit", "edit", "place the object and see the light, in the browser"),
-    ("run", "run", "do what is stale in a project, resuming what was killed"),
-    ("status", "status", "say what is done, what is stale and why"),
-    ("scale", "scale", "say how large a capture is, by a known length or a marker"),
-    ("capture", "steps.capture", "pose photos or a video, take over poses, or look at a scene from all around"),
-    ("adopt", "steps.adopt", "take over a scene that was trained elsewhere"),
-    ("reconstruct", "steps.reconstruct", "train a 3DGS scene on posed images"),
-    ("segment", "steps.segment", "lift 2D masks to the Gaussians of the object"),
-    ("compose", "steps.compose", "place the object in the target scene"),
-    ("relight", "steps.relight", "give the object the light of its new place"),
-    ("render", "steps.render", "render a scene or a composite from given cameras"),
-    ("harmonize", "steps.harmonize", "make the light of each rendered view agree"),
-    ("harmonize photo", "harmonize_photo", "the same for one picture and its mask, without any scene"),
-    ("consolidate", "steps.consolidate", "fit the colours of the scene to the harmonised views"),
-    ("evaluate", "steps.evaluate", "compare, picture and report"),
-    ("light", "light", "write the light at a place as an environment map and lamps, for other programs"),
-    ("export", "export", "write a scene or a result as a page, for another program, or as pictures"),
-    ("doctor", "doctor", "say what is installed, what is missing and how to get it"),
+    # command, module in splatgraft, summary
+    ("demo", "commands.demo", "run a whole transfer on captures that come with the package"),
+    ("try", "commands.first_try", "run a whole transfer on two captures of your own, at draft quality"),
+    ("check", "commands.check", "look at photos before time is spent on them"),
+    ("init", "commands.init", "write a commented project.toml for two captures"),
+    ("edit", "commands.edit", "place the object and see the light, in the browser"),
+    ("run", "commands.run", "do what is stale in a project, resuming what was killed"),
+    ("status", "commands.status", "say what is done, what is stale and why"),
+    ("scale", "commands.scale", "say how large a capture is, by a known length or a marker"),
+    *((row.command, f"steps.{row.command}", row.summary) for row in STEPS),
+    ("harmonize photo", "commands.harmonize_photo", "make the light of one picture agree, without a scene"),
+    ("light", "commands.light", "write the light at a place as an environment map and lamps, for other programs"),
+    ("export", "commands.export", "write a scene or a result as a page, for another program, or as pictures"),
+    ("doctor", "commands.doctor", "say what is installed, what is missing and how to get it"),
 )
 
 
@@ -60,7 +53,7 @@ def commands() -> Mapping[str, Command]:
 
     An entry point names rows (name, MODULE:CLASS, summary); each name begins with the name of the entry point.
     """
-    found = {name: Command(f"splatgraft.commands.{module}", summary) for name, module, summary in _TABLE}
+    found = {name: Command(f"splatgraft.{module}", summary) for name, module, summary in _TABLE}
     for entry in entry_points(group=ENTRY_POINTS):
         found |= {name: Command(place, summary) for name, place, summary in entry.load()}
     return found

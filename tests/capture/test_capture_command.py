@@ -14,7 +14,6 @@ from PIL import Image
 
 from splatgraft.capture import read_doubts, structure_from_motion
 from splatgraft.cli import main
-from splatgraft.commands.steps.reconstruct import far_worse
 from splatgraft.core import images
 from splatgraft.core.exposure import Exposure
 from splatgraft.core.posed_images import LeftOut
@@ -22,6 +21,7 @@ from splatgraft.folders.capture_files import left_out_notes
 from splatgraft.formats import read_capture
 from splatgraft.formats.captures.exif import exif_of, read_exposure
 from splatgraft.formats.captures.photo_archive import unpack_photos
+from splatgraft.steps.reconstruct import far_worse
 
 LARGE = (SIZE[0] * 8, SIZE[1] * 8)
 

@@ -7,9 +7,9 @@ import torch
 
 from splatgraft import formats
 from splatgraft.cli import main
-from splatgraft.commands.steps.adopt import misfit_of
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
+from splatgraft.steps.adopt import misfit_of
 from splatgraft.workflow.flow import read_flow
 
 TOOLS = Path(__file__).parents[1] / "formats" / "golden" / "tools"

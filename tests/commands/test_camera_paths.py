@@ -6,16 +6,16 @@ from pathlib import Path
 import pytest
 from tiny_project import photograph, plane
 
-from splatgraft.commands.steps.compose import Compose
-from splatgraft.commands.steps.evaluate import Evaluate
-from splatgraft.commands.steps.relight import Relight
-from splatgraft.commands.steps.render import Render
 from splatgraft.core.similarity import Similarity
 from splatgraft.folders.capture_files import camera_files
 from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.project.record import input_entries
 from splatgraft.project.step import Step
-from splatgraft.workflow.flow import STEPS
+from splatgraft.project.step_table import STEPS
+from splatgraft.steps.compose import Compose
+from splatgraft.steps.evaluate import Evaluate
+from splatgraft.steps.relight import Relight
+from splatgraft.steps.render import Render
 
 
 def steps(root: Path, cameras: Path) -> list[Step]:
@@ -39,7 +39,7 @@ def test_cameras_are_a_folder_or_a_file_in_every_step(tmp_path: Path) -> None:
         assert folder_step.inputs() == file_step.inputs()
         named = [path for files in folder_step.inputs().values() for path in files if path.parent == tmp_path / "c"]
         assert input_entries(named, ())
-    kinds = {kind for kind in STEPS for field in fields(kind) if field.name.endswith("cameras")}
+    kinds = {row.load() for row in STEPS for field in fields(row.load()) if field.name.endswith("cameras")}
     assert kinds == {type(step) for step in by_folder}
 
 

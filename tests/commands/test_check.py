@@ -159,7 +159,7 @@ def test_given_poses_and_masks_are_seen_and_a_video_is_looked_at(
     assert "given for 8 images" in findings["poses"]["text"]
     assert findings["masks"]["text"] == "8 masks"
     assert findings["overlap"]["level"] == "good"
-    assert "the photos go 315 of 360 degrees" in findings["coverage"]["text"]
+    assert "the photos cover 315 of 360 degrees" in findings["coverage"]["text"]
     photograph(tmp_path / "front", plane((0.3, 0.5, 0.3)), ball(), around_deg=120.0)
     _, findings, _ = check(tmp_path / "front", capsys)
     assert findings["coverage"]["level"] == "doubtful"

@@ -19,13 +19,13 @@ from killing import Killed, killed_at_write
 from tiny_project import ball, contents, photograph, plane
 
 from splatgraft.cli import main
-from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.core.images import read_rgb, write_image
 from splatgraft.formats import read_gaussians
 from splatgraft.harmonization import HARMONIZERS, CompactOptions, EditOptions, FluxOptions, HarmonizerOptions
 from splatgraft.project.record import read_record, why_stale
 from splatgraft.project.step import FolderCheckpoint, job_of, replacing
 from splatgraft.runtime.settings import choices, field_types
+from splatgraft.steps.harmonize import Harmonize
 from splatgraft.workflow.flow import read_flow
 
 STEPS = ("segment", "compose", "relight", "render", "harmonize", "consolidate", "evaluate")

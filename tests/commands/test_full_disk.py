@@ -16,8 +16,8 @@ import pytest
 from tiny_project import contents, copy_of
 
 from splatgraft.cli import main
-from splatgraft.commands.steps.render import Render
 from splatgraft.project.step import Context
+from splatgraft.steps.render import Render
 from splatgraft.workflow.flow import read_flow
 
 

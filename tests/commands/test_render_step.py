@@ -7,7 +7,6 @@ import pytest
 import torch
 from tiny_project import ball, photograph, plane
 
-from splatgraft.commands.steps.render import Render
 from splatgraft.core.gaussians import concatenate
 from splatgraft.formats import write_gaussians
 from splatgraft.project.gaussian_flags import write_flags
@@ -15,6 +14,7 @@ from splatgraft.project.step import job_of, perform
 from splatgraft.relighting import Light, LightSource, light_to_json
 from splatgraft.relighting.light.light import light_confidence
 from splatgraft.runtime.console import Console
+from splatgraft.steps.render import Render
 
 LIGHT = Light((LightSource((0.0, 0.0, 1.0), (2.0, 2.0, 2.0), confidence=0.5),), torch.full((9, 3), 0.1), coverage=0.8)
 

@@ -12,10 +12,10 @@ from tiny_project import ball, photograph, plane
 from splatgraft.cli import main
 from splatgraft.commands import first_try
 from splatgraft.commands.first_try import refinements
-from splatgraft.commands.steps import segment
 from splatgraft.project.record import Record, read_record, write_record
 from splatgraft.runtime.note import Note
 from splatgraft.segmentation import SolidifyOptions
+from splatgraft.steps import segment
 from splatgraft.workflow.flow import read_flow
 
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from splatgraft.cli import main
-from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import read_rgb
 from splatgraft.folders import harmonized_views
@@ -18,6 +17,7 @@ from splatgraft.harmonization import CompactOptions, Harmonized, HarmonizerInput
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import job_of, perform
 from splatgraft.runtime.console import Console
+from splatgraft.steps.harmonize import Harmonize
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_a_killed_run_keeps_its_views_and_does_no_more_than_the_rest(views, monk
 
         harmonize_part(part, say, counting)
 
-    monkeypatch.setattr("splatgraft.commands.steps.harmonize.harmonize_part", killed)
+    monkeypatch.setattr("splatgraft.steps.harmonize.harmonize_part", killed)
     with pytest.raises(KeyboardInterrupt):
         perform(step(views), Console())
     perform(step(views), Console())

@@ -10,7 +10,6 @@ pytest.importorskip("diffusers")
 from random_lpips import write_random_lpips
 from tiny_models import CHANNELS, flux_folder, quiet
 
-from splatgraft.commands.steps.harmonize import Harmonize
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.formats import read_gaussians
@@ -19,6 +18,7 @@ from splatgraft.harmonization.flux.harmonizer import FluxHarmonizer
 from splatgraft.project.step import perform
 from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
+from splatgraft.steps.harmonize import Harmonize
 from splatgraft_paper.commands.consolidate import Consolidate
 
 pytestmark = list(quiet)

@@ -8,7 +8,8 @@ import pytest
 
 from splatgraft.cli import main
 from splatgraft.project.project_file import TEMPLATE
-from splatgraft.workflow.flow import STEPS, read_flow
+from splatgraft.project.step_table import STEPS
+from splatgraft.workflow.flow import read_flow
 from splatgraft.workflow.project_reference import full_project_text, project_keys
 
 SIDES = {"source": 'capture = "a"', "target": 'capture = "b"'}
@@ -85,7 +86,7 @@ def test_the_defaults_of_the_full_file_change_nothing(tmp_path: Path) -> None:
 
 def test_every_table_and_key_is_described() -> None:
     tables = {table.name: table for table in project_keys()}
-    assert list(tables) == ["source", "target", *(kind.__name__.lower() for kind in STEPS)]
+    assert list(tables) == ["source", "target", *(row.command for row in STEPS if row.has_table)]
     keys = {key.name: key for key in tables["consolidate"].keys}
     assert (keys["nuisance"].type, keys["nuisance"].default) == ('"tint-flow" or "none"', '"tint-flow"')
     assert keys["scene"].default == '"relit/scene.ply"'

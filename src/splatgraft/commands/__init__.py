@@ -1,1 +1,1 @@
-"""The commands of the command line, one file each; the steps of a project are in `steps/`."""
+"""The commands that are no steps of a project, one file each."""

@@ -8,16 +8,16 @@ from itertools import count
 from pathlib import Path
 
 from splatgraft.commands.init import Init
-from splatgraft.commands.steps.segment import Segment
 from splatgraft.folders.input_description import describe_input
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE
 from splatgraft.project.record import read_record
-from splatgraft.project.step import DEFAULT_REMEDIES, Positional, Step
+from splatgraft.project.step import Positional, Step, default_remedy
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.process import open_page
 from splatgraft.runtime.settings import read_toml
+from splatgraft.steps.segment import Segment
 from splatgraft.workflow.flow import Flow, read_flow
 from splatgraft.workflow.run import run_steps
 
@@ -112,11 +112,11 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
             continue
         lines.append(f"unsure: {name}: {doubts[0]}{_more(doubts)}")
         remedies = [note.remedy for note in record.warnings if note.in_doubt and note.remedy]
-        helps += remedies[:1] or [DEFAULT_REMEDIES.get(record.step, "")]
+        helps += remedies[:1] or [default_remedy(step)]
     # later steps build on earlier ones, so the first doubt is the one to mend
     if not any(line.startswith("unsure: ") for line in lines):
         lines.append("no step warned of its result: look at the pictures; the cut of the object is mended most often")
-        helps = [DEFAULT_REMEDIES["segment"]]
+        helps = [Segment.remedy]
     lines.append(f"helps most: {next(filter(None, helps), '').replace('PROJECT', str(shown))}")
     quality = _FINER.get(_quality(folder / PROJECT_FILE) or "")
     finer = f'finer: quality = "{quality}" under [reconstruct] in {shown / PROJECT_FILE}, then splatgraft run {shown}'

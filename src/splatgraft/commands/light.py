@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.commands.steps.relight import Relight
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
@@ -27,6 +26,7 @@ from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.scene_light import place_of
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
+from splatgraft.steps.relight import Relight
 from splatgraft.workflow.flow import read_flow
 
 _RADIUS = 1 / 8

@@ -8,10 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 from splatgraft.commands.init import Init
-from splatgraft.commands.steps.capture import Capture
-from splatgraft.commands.steps.compose import Compose
-from splatgraft.commands.steps.relight import Relight
-from splatgraft.commands.steps.segment import Segment
 from splatgraft.composition import PlaceOptions
 from splatgraft.editor.placement import Triple
 from splatgraft.exports.export import Layer
@@ -29,6 +25,10 @@ from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LayerWeights, RelightOptions
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
+from splatgraft.steps.capture import Capture
+from splatgraft.steps.compose import Compose
+from splatgraft.steps.relight import Relight
+from splatgraft.steps.segment import Segment
 from splatgraft.workflow.flow import Flow, read_flow, reasons
 
 ExportPage = Literal["viewer", "report"]

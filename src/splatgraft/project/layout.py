@@ -26,21 +26,7 @@ EDITOR_FOLDER = ".editor"
 """Folder of the editor's own files, below the project's results: history, jobs."""
 
 Side = Literal["source", "target"]
-
-RESULTS_IN_ORDER = (
-    "source/capture",
-    "source/scene",
-    "target/capture",
-    "target/scene",
-    "object",
-    "composite",
-    "relit",
-    "views",
-    "harmonized",
-    "result",
-    "report",
-)
-"""All folders of a project, relative to its root, in the order of their making."""
+SIDES: tuple[Side, ...] = ("source", "target")
 
 
 @dataclass(frozen=True)

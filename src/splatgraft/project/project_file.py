@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from splatgraft.formats import is_scene
-from splatgraft.project.layout import Side
+from splatgraft.project.layout import SIDES, Side
 from splatgraft.runtime.settings import Table, from_table, path_beside, read_toml
 
 T = TypeVar("T")
@@ -103,14 +103,13 @@ class ProjectFile:
 def read_project_file(path: Path, *, tables: tuple[str, ...]) -> ProjectFile:
     """Read project.toml; `tables` are allowed beside [source] and [target]."""
     content = read_toml(path)
-    known = ("source", "target", *tables)
+    known = (*SIDES, *tables)
     for name, table in content.items():
         if name not in known:
             raise ValueError(f"{path}: expected tables among {', '.join(known)}; found {name}")
         if not isinstance(table, dict):
             raise ValueError(f"{path}: expected [{name}] to be a table, found {table!r}")
-    sides: tuple[Side, ...] = ("source", "target")
-    for side in sides:
+    for side in SIDES:
         _check_side(path, side, content.get(side, {}))
         if inner := [k for k, v in content[side].items() if isinstance(v, dict) and k != "reconstruct"]:
             raise ValueError(f"{path}: expected no table in [{side}] but [{side}.reconstruct], found {inner[0]}")

@@ -34,6 +34,8 @@ class Job:
     """Files whose content the result depends on, by role."""
     options: Mapping[str, Any]
     """Plain JSON values that the result depends on."""
+    remedy: str = ""
+    """Advice for warnings that have none of their own."""
 
     @cached_property
     def entries(self) -> Mapping[str, tuple[Entry, ...]]:

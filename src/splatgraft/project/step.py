@@ -29,14 +29,6 @@ Inputs = Mapping[str, tuple[Path, ...]]
 _MACHINE = ("device", "batch", "compile", "processes", "ray", "max_cost", "accept_doubtful")
 """Options that change the device, the speed, or whether a run continues after the step, but not the result."""
 _CONTINUES = "; earlier results are complete, and the same command continues when there is room"
-DEFAULT_REMEDIES = {
-    "capture": "add or replace the photos named, or take more, sharper and with more overlap: splatgraft check PHOTOS",
-    "reconstruct": "leave the named photos out, or lock exposure and photograph again: splatgraft check PHOTOS",
-    "segment": "put the box around the object, or paint what is missing: splatgraft edit PROJECT, step Select",
-    "compose": "drag the object to where it should stand and press Drop: splatgraft edit PROJECT, step Place",
-    "relight": "turn the arrow of the light to where it comes from: splatgraft edit PROJECT, step Light",
-}
-"""Remedies for warnings that have none of their own, by step; PROJECT is replaced by the project's folder."""
 
 
 class FolderCheckpoint:
@@ -108,7 +100,18 @@ def job_of(step: Step) -> Job:
     """Return the job of `step`; a method `recorded_options` of the step replaces its fields."""
     recorded = getattr(step, "recorded_options", None)
     options: dict[str, Any] = plain_options(vars(step)) if recorded is None else recorded()
-    return Job(step=type(step).__name__.lower(), folder=step.out, inputs=step.inputs(), options=options)
+    return Job(
+        step=type(step).__name__.lower(),
+        folder=step.out,
+        inputs=step.inputs(),
+        options=options,
+        remedy=default_remedy(step),
+    )
+
+
+def default_remedy(step: Step) -> str:
+    """Return the step's advice for warnings that have none of their own; PROJECT stands for the project's folder."""
+    return getattr(step, "remedy", "")
 
 
 def path_fields(step: Step) -> list[Path]:
@@ -216,7 +219,7 @@ def replacing(job: Job, warned: Sequence[Note] = ()) -> Generator[Path]:
 
 def _recorded(note: Note, job: Job, new: Path) -> Note:
     """Return the note with a remedy, and with its picture relative to the result's final folder."""
-    remedy = note.remedy or DEFAULT_REMEDIES.get(job.step, "")
+    remedy = note.remedy or job.remedy
     if note.picture is None:
         return replace(note, remedy=remedy)
     base = new if note.picture.is_relative_to(new) else job.folder

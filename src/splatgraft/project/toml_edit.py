@@ -1,4 +1,7 @@
-"""Set keys of a TOML text line by line, so that comments and all other lines stay unchanged."""
+"""Set keys of a TOML text line by line, so that comments and all other lines stay unchanged.
+
+tomlkit 0.15 would add a new key after the comments that belong to the next table.
+"""
 
 import json
 import re

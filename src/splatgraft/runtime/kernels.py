@@ -15,7 +15,7 @@ KERNEL_LOCK = threading.Lock()
 start kernels at the same time."""
 
 # OpenMP shares its threads with torch. TBB, numba's first choice, may wait for minutes at the end of a busy process.
-numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
+numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # pyright: ignore
 
 _IMPORT = re.compile(rb"^(?:from [\w.]+ )?import (?:\([^)]*\)|.*)", re.MULTILINE)
 
@@ -57,7 +57,7 @@ def _hash_of_sources(file: Path) -> str:
 def threading_layer() -> str:
     """Return the library whose threads run numba's kernels: omp, else workqueue; NUMBA_THREADING_LAYER overrides it."""
     numba.get_num_threads()  # chooses the layer
-    return numba.threading_layer()
+    return numba.threading_layer()  # pyright: ignore[reportPrivateImportUsage]
 
 
 def serialized(kernel: Callable[..., Any]) -> Callable[..., Any]:

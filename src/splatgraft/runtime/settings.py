@@ -1,4 +1,7 @@
-"""Frozen dataclasses built from TOML tables, with one-line errors that name the file and the key."""
+"""Frozen dataclasses built from TOML tables, with one-line errors that name the file and the key.
+
+msgspec would convert the values, but its errors name no choices, and of most wrong values only the type.
+"""
 
 import json
 import math

@@ -3,36 +3,16 @@
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from splatgraft.commands.steps.adopt import Adopt
-from splatgraft.commands.steps.capture import Capture
-from splatgraft.commands.steps.compose import Compose
-from splatgraft.commands.steps.consolidate import Consolidate
-from splatgraft.commands.steps.evaluate import Evaluate
-from splatgraft.commands.steps.harmonize import Harmonize
-from splatgraft.commands.steps.reconstruct import Reconstruct
-from splatgraft.commands.steps.relight import Relight
-from splatgraft.commands.steps.render import Render
-from splatgraft.commands.steps.segment import Segment
-from splatgraft.project.layout import (
-    CAMERAS_FILE,
-    IS_OBJECT_FILE,
-    LIGHT_FILE,
-    LIGHT_TEXT_FILE,
-    OBJECT_FILE,
-    PLACEMENT_FILE,
-    PROJECT_FILE,
-    SCENE_FILE,
-    SURROUNDINGS_FILE,
-    Layout,
-    Side,
-)
+from splatgraft.project.layout import PLACEMENT_FILE, PROJECT_FILE, SIDES, Layout
 from splatgraft.project.project_file import ProjectFile, read_project_file
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import Step, job_of, path_fields
-
-STEPS = (Capture, Reconstruct, Segment, Compose, Relight, Render, Harmonize, Consolidate, Evaluate)
+from splatgraft.project.step_table import STEPS
+from splatgraft.steps.adopt import Adopt
+from splatgraft.steps.capture import Capture
+from splatgraft.steps.compose import Compose
+from splatgraft.steps.reconstruct import Reconstruct
 
 
 @dataclass(frozen=True)
@@ -73,11 +53,10 @@ def read_flow(project: Path, out: Path | None = None) -> Flow:
     Raises: ValueError if the file is missing, or one of its keys or values is not as expected.
     """
     path = project / PROJECT_FILE if project.is_dir() else project
-    file = read_project_file(path, tables=tuple(kind.__name__.lower() for kind in STEPS))
+    file = read_project_file(path, tables=tuple(row.command for row in STEPS if row.has_table))
     layout = Layout(path.parent if out is None else out)
-    sides: tuple[Side, ...] = ("source", "target")
     steps: dict[str, Step] = {}
-    for side in sides:
+    for side in SIDES:
         steps[f"{side}/capture"] = capture = file.step(Capture, out=layout.capture(side), side=side)
         given = {"capture": layout.capture(side)}
         if (trained := file.scene(side)) is None:
@@ -105,43 +84,14 @@ def _require_order(project: Path, flow: Flow) -> None:
 
 def _joint_steps(file: ProjectFile, layout: Layout) -> dict[str, Step]:
     placement = file.path.parent / PLACEMENT_FILE
-    given = default_paths(layout)
-    if placement.is_file():
-        given[Compose] = given[Compose] | {"placement": placement}
-    folders = (layout.object, layout.composite, layout.relit, layout.views)
-    folders += (layout.harmonized, layout.result, layout.report)
-    plan = zip(given.items(), folders, strict=True)
-    return {kind.__name__.lower(): file.step(kind, paths, out=out) for (kind, paths), out in plan}
-
-
-def default_paths(layout: Layout) -> dict[type[Any], dict[str, Path]]:
-    """Return the input paths that a project gives to each step after the reconstructions, in the order of the flow."""
-    source, target = (layout.scene(side) / SCENE_FILE for side in ("source", "target"))
-    source_capture, target_capture = layout.capture("source"), layout.capture("target")
-    cameras, source_cameras = (layout.capture(side) / CAMERAS_FILE for side in ("target", "source"))
-    surroundings = layout.object / SURROUNDINGS_FILE
-    composite, relit = layout.composite / SCENE_FILE, layout.relit / SCENE_FILE
-
-    segment = {"scene": source, "capture": source_capture}
-    compose = {"target": target, "object": layout.object / OBJECT_FILE, "surroundings": surroundings}
-    compose |= {"cameras": cameras, "object_cameras": source_cameras}
-    relight = {"target": target, "placement": layout.composite / PLACEMENT_FILE, "cameras": cameras}
-    relight |= {"surroundings": surroundings, "object_cameras": source_cameras, "taken": layout.object / OBJECT_FILE}
-    render = {"scene": composite, "cameras": cameras, "is_object": layout.composite / IS_OBJECT_FILE}
-    render |= {"prior": relit, "light": layout.relit / LIGHT_FILE}
-    consolidate = {"scene": relit, "views": layout.views, "images": layout.harmonized}
-    evaluate = {"result": layout.result / SCENE_FILE, "composite": layout.composite, "cameras": cameras}
-    evaluate |= {"target_capture": target_capture, "views": layout.views, "light": layout.relit / LIGHT_TEXT_FILE}
-    evaluate |= {"project": layout.root}
-    return {
-        Segment: segment,
-        Compose: compose,
-        Relight: relight,
-        Render: render,
-        Harmonize: {"views": layout.views},
-        Consolidate: consolidate,
-        Evaluate: evaluate,
-    }
+    steps: dict[str, Step] = {}
+    for row in STEPS:
+        if not row.per_capture:
+            kind, given = row.load(), {name: layout.root / path for name, path in row.inputs.items()}
+            if kind is Compose and placement.is_file():
+                given["placement"] = placement
+            steps[row.command] = file.step(kind, given, out=layout.root / row.folder)
+    return steps
 
 
 def reasons(flow: Flow, wanted: Collection[str] | None = None) -> dict[str, str | None]:

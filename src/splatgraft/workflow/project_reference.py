@@ -11,9 +11,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
-from splatgraft.project.layout import Layout
+from splatgraft.project.step_table import STEPS
 from splatgraft.runtime.settings import choices, default_of, field_types
-from splatgraft.workflow.flow import STEPS, default_paths
 
 _TYPE_NAMES = {int: "integer", float: "number", bool: "true or false", str: "text", Path: "path"}
 _EXAMPLES = {int: "1", float: "1.0", bool: "true", str: '"text"', Path: '"path"'}
@@ -158,17 +157,17 @@ def project_keys() -> tuple[KeyTable, ...]:
     Paths of results are relative to the folder of project.toml. [source.reconstruct] and [target.reconstruct] take the
     keys of [reconstruct] for one capture alone; the source is a draft unless its own table gives a quality.
     """
-    given = default_paths(Layout(Path()))
     sides = tuple(KeyTable(side, meaning, _SIDE_KEYS) for side, meaning in _CAPTURE_KEYS.items())
     # [capture] and [reconstruct] serve both sides: one path for both would be wrong
     steps = tuple(
         describe_table(
-            kind.__name__.lower(),
-            kind,
-            given=given.get(kind),
-            omitted=frozenset({"out"} if kind in given else {"out", "capture"}),
+            row.command,
+            row.load(),
+            given=row.inputs,
+            omitted=frozenset({"out", "capture"} if row.per_capture else {"out"}),
         )
-        for kind in STEPS
+        for row in STEPS
+        if row.has_table
     )
     return sides + steps
 

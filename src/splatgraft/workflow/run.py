@@ -3,12 +3,12 @@
 from contextlib import nullcontext
 from pathlib import Path
 
-from splatgraft.commands.steps.capture import Capture, doubt_about
 from splatgraft.project.layout import REPORT_FILE, SCENE_FILE
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import clear_leftovers, job_of, locked, perform
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import is_writable
+from splatgraft.steps.capture import Capture, doubt_about
 from splatgraft.workflow.flow import read_flow, reasons
 from splatgraft.workflow.time_estimate import describe_estimate, estimate_step_times
 

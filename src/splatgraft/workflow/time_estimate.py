@@ -7,10 +7,6 @@ from pathlib import Path
 import torch
 
 from splatgraft.capture import VIDEO_FRAMES, predict_pose_seconds
-from splatgraft.commands.steps.capture import Capture
-from splatgraft.commands.steps.reconstruct import Reconstruct
-from splatgraft.commands.steps.render import Render
-from splatgraft.commands.steps.segment import SOLID_SIDE_PX, Segment
 from splatgraft.core.cameras import Cameras, pinhole
 from splatgraft.core.images import stored_size
 from splatgraft.editor.jobs import PlannedStep
@@ -20,24 +16,16 @@ from splatgraft.formats.captures.masks import find_photos
 from splatgraft.formats.captures.photo_archive import count_archived_photos, is_archive
 from splatgraft.project.record import Record, read_record
 from splatgraft.project.step import Step, plain_options
+from splatgraft.project.step_table import STEPS
 from splatgraft.reconstruction import predict_cpu_seconds
+from splatgraft.steps.capture import Capture
+from splatgraft.steps.reconstruct import Reconstruct
+from splatgraft.steps.render import Render
+from splatgraft.steps.segment import SOLID_SIDE_PX, Segment
 from splatgraft.workflow.flow import Flow
 
-_TYPICAL_SECONDS = {
-    "capture": 1.0,
-    "adopt": 0.2,
-    "reconstruct": 56.0,
-    "segment": 5.0,
-    "compose": 0.2,
-    "relight": 15.0,
-    "render": 1.0,
-    "harmonize": 1.1,
-    "consolidate": 2.0,
-    "evaluate": 3.0,
-}
-"""Seconds in a first `splatgraft demo` on two cores, including compilation of the kernels.
-
-Other projects differ by a factor, which is taken from their finished steps."""
+_TYPICAL_SECONDS = {row.command: row.seconds for row in STEPS}
+"""Seconds by step; other projects differ by a factor, which is taken from their finished steps."""
 _SECONDS_PER_CUT = 1.2  # per photo without a mask
 _SECONDS_PER_OBJECT_PIXEL = 7e-8
 """Seconds per step of the object's fit and pixel of a photo; half for a small object, twice for one that fills it."""

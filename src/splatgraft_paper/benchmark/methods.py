@@ -4,9 +4,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from splatgraft.commands.steps import harmonize
-from splatgraft.commands.steps.relight import Relight
-from splatgraft.commands.steps.render import Render
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.harmonization import HarmonizerOptions, NoneOptions
@@ -15,6 +12,9 @@ from splatgraft.project.step import Context, Device, Inputs
 from splatgraft.relighting import SourceScene, relight
 from splatgraft.relighting.light.light import light_to_json
 from splatgraft.runtime.console import Console
+from splatgraft.steps import harmonize
+from splatgraft.steps.relight import Relight
+from splatgraft.steps.render import Render
 from splatgraft_paper.benchmark.gain import relight_by_gain
 from splatgraft_paper.benchmark.scene import ComposedScene, perform_if_stale
 from splatgraft_paper.benchmark.transplat import relight_by_irradiance_ratio

@@ -4,9 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatgraft.commands.steps.compose import Compose
-from splatgraft.commands.steps.reconstruct import Reconstruct
-from splatgraft.commands.steps.segment import Segment
 from splatgraft.core.posed_images import held_out
 from splatgraft.formats import read_capture, write_capture
 from splatgraft.project.layout import (
@@ -21,6 +18,9 @@ from splatgraft.project.record import read_record, why_stale
 from splatgraft.project.step import Device, Step, job_of, perform
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
+from splatgraft.steps.compose import Compose
+from splatgraft.steps.reconstruct import Reconstruct
+from splatgraft.steps.segment import Segment
 from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE
 
 HELD_OUT_EVERY = 8

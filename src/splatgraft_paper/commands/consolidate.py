@@ -7,7 +7,6 @@ from typing import Literal
 
 import torch
 
-from splatgraft.commands.steps import consolidate as tool
 from splatgraft.consolidation import ImageSequence, consolidate
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
@@ -33,6 +32,7 @@ from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft.runtime.progress import NoCheckpoint
 from splatgraft.runtime.settings import Table, from_table
+from splatgraft.steps import consolidate as tool
 from splatgraft_paper.consolidation import NoisyStartHarmonizer, PaperDescent, Schedule, descend_as_paper, noise_levels
 
 

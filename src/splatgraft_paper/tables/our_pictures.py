@@ -9,7 +9,6 @@ from pathlib import Path
 
 import torch
 
-from splatgraft.commands.steps.compose import Compose
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
 from splatgraft.core.similarity import Similarity
@@ -21,6 +20,7 @@ from splatgraft.project.step import Context, Device, Inputs, choose_device
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
+from splatgraft.steps.compose import Compose
 from splatgraft_paper.benchmark.methods import Method, MethodSettings, run_method
 from splatgraft_paper.benchmark.scene import ComposedScene, GroundTruthScene, compose_scene, perform_if_stale
 from splatgraft_paper.tables.layout import PaperScene, held_out_stems

@@ -34,9 +34,10 @@ from splatgraft.evaluation import (
 from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.evaluated_scenes import EvaluatedScenes, Pictures, TrueViews, truth_files
-from splatgraft.project.layout import RESULTS_IN_ORDER, SCENE_FILE
+from splatgraft.project.layout import SCENE_FILE
 from splatgraft.project.record import Record, read_record
 from splatgraft.project.step import Context, Device, Inputs, choose_device, plain_options
+from splatgraft.project.step_table import RESULTS_IN_ORDER
 from splatgraft.rendering import render
 from splatgraft.runtime.note import Note
 

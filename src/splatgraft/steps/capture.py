@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
 from splatgraft.capture import (
     PoseOptions,
@@ -40,6 +41,10 @@ from splatgraft.runtime.note import Note
 class Capture:
     """Pose photos or a video. Existing poses are taken over, and their images are referred to. A trained scene without
     photographs is rendered from all around."""
+
+    remedy: ClassVar[str] = (
+        "add or replace the photos named, or take more, sharper and with more overlap: splatgraft check PHOTOS"
+    )
 
     capture: Positional
     """A folder or a .zip of photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene (.ply,

@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -34,6 +34,8 @@ EVAL_EVERY = 8
 @dataclass(frozen=True)
 class Reconstruct:
     """Train a 3DGS scene on posed images."""
+
+    remedy: ClassVar[str] = "leave the named photos out, or lock exposure and photograph again: splatgraft check PHOTOS"
 
     capture: Positional
     """A COLMAP folder, a folder with transforms.json, or the result of `splatgraft capture`."""

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
 from splatgraft.composition import NoFreePlaceError, Placed, PlaceOptions, place_object
 from splatgraft.core.gaussians import Gaussians
@@ -22,6 +23,10 @@ _MUCH_UNSEEN = 0.2  # share of the target's images; warn if more of them show an
 @dataclass(frozen=True)
 class Compose:
     """Place the object in the target: by placement.json, or upright on a surface with room for it."""
+
+    remedy: ClassVar[str] = (
+        "drag the object to where it should stand and press Drop: splatgraft edit PROJECT, step Place"
+    )
 
     target: Path
     """The scene that receives the object, a .ply."""

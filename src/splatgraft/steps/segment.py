@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -71,6 +71,10 @@ _MUCH_GUESSED = 0.1  # share of the surface; warn if more was never photographed
 @dataclass(frozen=True)
 class Segment:
     """Lift 2D masks of the object to the Gaussians of a scene."""
+
+    remedy: ClassVar[str] = (
+        "put the box around the object, or paint what is missing: splatgraft edit PROJECT, step Select"
+    )
 
     scene: Path
     """The reconstruction, a .ply."""

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 
@@ -28,6 +28,8 @@ from splatgraft.runtime.note import Note
 @dataclass(frozen=True)
 class Relight:
     """Light the object by its new place and add its shadow to the place; no training, no images."""
+
+    remedy: ClassVar[str] = "turn the arrow of the light to where it comes from: splatgraft edit PROJECT, step Light"
 
     target: Path
     """The scene that receives the object, a .ply."""
