@@ -153,7 +153,7 @@ def test_validation_shows_held_out_pairs_and_the_end_says_the_speed(tmp_path):
     run = training(tmp_path, "out", say=said.append)
     run.train()
     assert any("(held out)" in line for line in said)
-    assert re.fullmatch(r"throughput: [\d.]+ pairs/s; \d+% of the time waited for pictures", said[-1])
+    assert re.fullmatch(r"throughput: [\d.]+ pairs/s; \d+% of the time spent waiting for pictures", said[-1])
     sheet = read_rgb(tmp_path / "out" / "validation" / "00000003.png")
     assert sheet.shape == (2 * 32, 3 * 32, 3)
     trained, shown = ({pair.group for pair in one.all()} for one in (run.task.data.mixture, run.task.data.held_out))
@@ -162,7 +162,7 @@ def test_validation_shows_held_out_pairs_and_the_end_says_the_speed(tmp_path):
 
 def test_another_training_in_the_folder_is_refused(tmp_path):
     training(tmp_path, "out").train()
-    line = r"out: expected the same training to go on with, found rate 0.001 instead of 0.5"
+    line = r"out: expected the same training to resume, found rate 0.001 instead of 0.5"
     with pytest.raises(ValueError, match=line):
         training(tmp_path, "out", replace(QUICK, rate=0.5, steps=8)).train()
 
@@ -195,7 +195,7 @@ def test_a_pair_whose_loss_is_no_number_is_named_and_the_step_before_is_kept(tmp
     latents = run.cache.encode_missing([loaded], run.task.objective.roles)["composite"][0]
     write_tensors(loaded.paths["composite"], {"latents": latents.fill_(float("nan")).to(torch.bfloat16)})
     line = (
-        f"a finite loss and gradient at step {step + 1}, found none for {bad.relit}; the state of step {step} is kept"
+        f"a finite loss and gradient at step {step + 1}, found others for {bad.relit}; the state of step {step} is kept"
     )
     with pytest.raises(ValueError, match=re.escape(line)):
         run.train()
@@ -235,7 +235,7 @@ def test_a_damaged_state_is_said_and_the_one_before_it_is_taken(tmp_path):
     said = []
     assert training(tmp_path, "out", say=said.append).train() == model
     assert (model / WEIGHTS).read_bytes() == before
-    assert "00000006: expected a whole state, found" in said[0]
+    assert "00000006: expected a complete state, found" in said[0]
     assert "resumed from step 4" in said
 
 

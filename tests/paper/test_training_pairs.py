@@ -70,7 +70,7 @@ def test_without_a_recipe_the_sources_are_drawn_as_in_the_paper_and_their_shares
     found = open_training_data(DataOptions(pairs=(str(rendered),), generated=(str(relit),), size="16x16"), 0, None)
     paper = {source.option: source.weight for source in Recipe.read("paper").sources}
     assert found.mixture.weights == (paper["pairs"], paper["generated"])
-    assert found.lines[0].endswith("54% of the pairs that are drawn")
+    assert found.lines[0].endswith("54% of the drawn pairs")
     other = DataOptions(pairs=(str(rendered),), generated=(str(relit),), size="16x16", weights=(3.0, 1.0))
     assert "75%" in open_training_data(other, 0, None).lines[0]
 

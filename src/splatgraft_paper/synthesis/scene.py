@@ -64,7 +64,7 @@ class Part:
 class Lamp:
     """A light source without geometry."""
 
-    kind: Literal["sun", "area", "point"]
+    kind: Literal["sun", "area", "point", "spot"]
     color: Color
     power: Number
     """Power, W; of a sun W/m^2."""
@@ -72,7 +72,7 @@ class Lamp:
     direction: Vector = (0.0, 0.0, -1.0)
     """Direction in which the light travels; not used by `point`."""
     size: Number = 0.1
-    """Side of an area, radius of a point, metres; angular diameter of a sun, radians."""
+    """Side of an area, radius of a point or spot, metres; angular diameter of a sun, radians."""
     height: Number = 0.0
     """Other side of a rectangular area, metres; 0 for a square."""
 
