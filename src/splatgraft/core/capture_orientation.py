@@ -67,21 +67,13 @@ def quarter_turns(world_from_camera: Float[Tensor, "v 4 4"]) -> Int[Tensor, "v"]
 
 
 def focus_point(cameras: Cameras) -> Float[Tensor, "3"]:
-    """Find the point nearest to all optical axes, world units, by iteratively reweighted least squares.
+    """Compute the point nearest to all optical axes, world units (see `nearest_to_axes`).
 
     Raises:
-        ValueError: It lies behind many cameras, as in a capture that looks outwards.
+        ValueError: The point lies behind many cameras, for example if the capture looks outwards.
     """
-    centers, forward = cameras.centers.double(), cameras.world_from_camera[:, :3, 2].double()
-    weight = torch.ones(len(cameras), dtype=torch.float64)
-    point = centers.mean(0)
-    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
-    for _ in range(_ROUNDS):
-        normal = (weight[:, None, None] * across).sum(0)
-        wanted = torch.einsum("v,vij,vj->i", weight, across, centers)
-        point = torch.linalg.lstsq(normal + 1e-9 * torch.eye(3, dtype=torch.float64), wanted[:, None]).solution[:, 0]
-        miss = torch.einsum("vij,vj->vi", across, point - centers).norm(dim=-1)
-        weight = 1 / (miss + _RESIDUAL_FLOOR * miss.median() + 1e-9)
+    point = nearest_to_axes(cameras, prior_weight=0.0)
+    centers, forward = cameras.centers.double().cpu(), cameras.world_from_camera[:, :3, 2].double().cpu()
     in_front = float((((point - centers) * forward).sum(-1) > 0).double().mean())
     if in_front < _MIN_IN_FRONT:
         raise ValueError(
@@ -89,3 +81,31 @@ def focus_point(cameras: Cameras) -> Float[Tensor, "3"]:
             " name the place"
         )
     return point.to(cameras.world_from_camera)
+
+
+def nearest_to_axes(cameras: Cameras, *, prior_weight: float) -> Float[Tensor, "3"]:
+    """Compute the point nearest to most optical axes by iteratively reweighted least squares.
+
+    Args:
+        cameras: v cameras.
+        prior_weight: Weight, over that of the axes, of a point in front of the mean camera, at twice their spread.
+            This point decides if the angles between the axes are below about sqrt(prior_weight) radians.
+
+    Returns:
+        The point, world units, float64 on the CPU. It may lie behind cameras that look outwards. Without a prior, it is
+        the one nearest to the origin if the axes are parallel.
+    """
+    centers, forward = cameras.centers.double().cpu(), cameras.world_from_camera[:, :3, 2].double().cpu()
+    spread = max(float((centers - centers.mean(0)).norm(dim=1).max()), 1e-3)
+    prior = (centers + 2 * spread * forward).mean(0)
+    identity = torch.eye(3, dtype=torch.float64)
+    across = identity - forward[:, :, None] * forward[:, None, :]
+    weight, point = torch.ones(len(cameras), dtype=torch.float64), prior
+    for _ in range(_ROUNDS):
+        of_prior = prior_weight * weight.sum()
+        wanted = torch.einsum("v,vij,vj->i", weight, across, centers) + of_prior * prior
+        normal = (weight[:, None, None] * across).sum(0) + of_prior * identity
+        point = torch.linalg.lstsq(normal, wanted[:, None], rcond=1e-9).solution[:, 0]
+        miss = torch.einsum("vij,vj->vi", across, point - centers).norm(dim=-1)
+        weight = 1 / (miss + _RESIDUAL_FLOOR * miss.median() + 1e-9)
+    return point

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import nearest_to_axes
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 
@@ -124,20 +125,10 @@ def random_seeds(cameras: Cameras, *, count: int, seed: int) -> SeedPoints:
 
 
 def looked_at(cameras: Cameras) -> tuple[Float[Tensor, "3"], float]:
-    """The point nearest to all optical axes, and the cameras' mean distance from it, world units."""
-    centers, forward = cameras.centers.double().cpu(), cameras.world_from_camera[:, :3, 2].double().cpu()
-    focus = _nearest_to_axes(centers, forward)
-    return focus, float((centers - focus).norm(dim=1).mean())
-
-
-def _nearest_to_axes(centers: Float[Tensor, "v 3"], forward: Float[Tensor, "v 3"]) -> Float[Tensor, "3"]:
-    """Least-squares intersection of the optical axes, with a weak prior in front of the cameras for parallel axes."""
-    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
-    spread = max(float((centers - centers.mean(0)).norm(dim=1).max()), 1e-3)
-    prior = (centers + 2 * spread * forward).mean(0)
-    weight = 1e-3 * len(centers)
-    matrix = across.sum(0) + weight * torch.eye(3, dtype=torch.float64)
-    return torch.linalg.solve(matrix, (across @ centers[..., None]).sum(0)[:, 0] + weight * prior)
+    """Compute the point nearest to most optical axes, and the cameras' mean distance from it, world units."""
+    # axes closer than two degrees do not determine a distance
+    focus = nearest_to_axes(cameras, prior_weight=1e-3)
+    return focus, float((cameras.centers.double().cpu() - focus).norm(dim=1).mean())
 
 
 def _views_that_see(points: Float[Tensor, "m 3"], cameras: Cameras) -> Float[Tensor, "m"]:
