@@ -63,8 +63,8 @@ def test_copies_lose_the_same_old_light_and_a_strange_object_keeps_its_own(tmp_p
     objects = {"strange.ply": (ball(), [at(0, 0.5)]), "own.ply": (ball(), [at(-0.2, 0), at(0.2, 0)])}
     found = relit(tmp_path, (room(0.8), room(0.25)), objects)
     notes = (found / "light.txt").read_text().splitlines()
-    assert "The light that object 1 had is not known: it keeps its mean brightness." in notes
-    old = [next(note for note in notes if f"object {number} comes from" in note) for number in (2, 3)]
+    assert "The old light of object 1 is unknown: the object keeps its mean brightness." in notes
+    old = [next(note for note in notes if f"old place of object {number}:" in note) for number in (2, 3)]
     assert old[0].replace("object 2", "object 3") == old[1]
     strange, one, other = read_gaussians(found / "scene.ply").sh[-3 * ball().count :, 0].chunk(3)
     kept, lost, also_lost = (float((colors - ball().sh[:, 0]).mean()) for colors in (strange, one, other))

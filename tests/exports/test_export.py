@@ -112,7 +112,7 @@ def test_the_first_view_and_the_path_begin_on_the_side_that_was_photographed(tmp
 def test_a_scene_without_cameras_says_what_it_assumes(tmp_path, capsys):
     write_gaussians(tmp_path / "vase.ply", random_gaussians(300, 1))
     assert main(["export", str(tmp_path / "vase.ply"), "--to", str(tmp_path / "vase.html")]) == 0
-    assert "up is not known and taken to be -y" in capsys.readouterr().err
+    assert "the up direction is not known and taken to be -y" in capsys.readouterr().err
     assert "<title>Vase</title>" in (tmp_path / "vase.html").read_text()
 
 
