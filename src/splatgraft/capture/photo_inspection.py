@@ -19,6 +19,7 @@ from jaxtyping import UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from splatgraft.capture.structure_from_motion import MIN_POSED_SHARE
 from splatgraft.capture.usable_views import MIN_VIEWS, log_sharpness
 from splatgraft.core.exposure import Exposure, describe_inconsistency
 from splatgraft.core.posed_images import LeftOut
@@ -41,7 +42,6 @@ _SHARP_MEDIAN = -1.8
 """Smallest median sharpness of a sharp capture, octaves. Ten captures (seven photographed, three rendered) have -1.2 to
 0.6; with motion blur of 9 px at 640 px, -3.6 to -1.8."""
 _JUMP_STOPS = 0.4  # largest brightness difference from both neighbours; captures of fixed exposure have up to 0.31
-_MIN_TOGETHER = 0.5  # smallest share of connected photos: structure from motion demands as many poses
 _NAMED = 6  # most photos that a finding names
 
 Grey = UInt8[np.ndarray, "h w"]
@@ -280,7 +280,7 @@ def _overlap(found: Mapping[tuple[int, int], _Link | None], names: Sequence[str]
     if len(largest) == n:
         return Finding("overlap", "good", f"all photos are connected, {middle} matches between neighbours")
     apart = tuple(names[i] for group in groups[1:] for i in group)
-    if len(largest) < _MIN_TOGETHER * n:
+    if len(largest) < MIN_POSED_SHARE * n:
         text = f"only {len(largest)} of {n} photos show one place together; photos in the largest groups: "
         sizes = ", ".join(str(len(group)) for group in groups[:4])
         remedy = "take photos of one place, a step apart, with two thirds overlap and texture in view"

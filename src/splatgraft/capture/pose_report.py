@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from splatgraft.capture.colmap_process.job import MIN_INLIERS
 from splatgraft.formats.json_file import load, save
 
 POSE_REPORT_FILE = "pose_report.json"
 
 _FEW_FEATURES = 500  # most photos have thousands, one in ten of them matches in the next photo
-_FEW_MATCHES = 30  # fewest matches for a pose (COLMAP: abs_pose_min_num_inliers)
 
 # plausible ranges of the figures
 _MIN_REGISTERED = 0.7  # share of photos with a pose; a result with fewer is usable, but a third is missing
@@ -62,7 +62,7 @@ class Unposed:
         """Return the name and the usual reason for such figures."""
         if self.features < _FEW_FEATURES:
             reason = "blurred, dark or without texture"
-        elif self.matches < _FEW_MATCHES:
+        elif self.matches < MIN_INLIERS:
             reason = "shows another place, or is too far from the next photo"
         else:
             reason = "something moved, is mirrored or repeats itself, or a photo between two views is missing"

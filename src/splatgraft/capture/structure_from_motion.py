@@ -35,7 +35,8 @@ _ADVICE = (
     "shiny things, at one zoom setting (or say that each photo has its own camera: lens = each)"
 )
 _EXHAUSTIVE = 80  # largest number of photos for which all pairs are matched by default
-_ENOUGH = 0.5  # smallest share of photos with a pose; photos without one are named and left out
+MIN_POSED_SHARE = 0.5
+"""Smallest share of photos with a pose; photos without one are named and left out."""
 _THOROUGH_COST = 40  # time of a thorough attempt over that of a quick one (more, affine features; guided matching)
 
 
@@ -112,7 +113,7 @@ def pose_photos(
         say(f"structure from motion took {seconds:.0f} s ({parts}), {cpu:.0f} CPU-s")
         latest = found[-1][1]
         minutes = max(1, round(_THOROUGH_COST * seconds / 60))
-        if latest.registered >= _ENOUGH * len(copies):
+        if latest.registered >= MIN_POSED_SHARE * len(copies):
             if latest.doubts and effort == "quick":
                 doubts = "; ".join(map(str, latest.doubts))
                 say(f'poses are doubtful ({doubts}); effort = "thorough" finds more features, in about {minutes} min')
@@ -124,7 +125,7 @@ def pose_photos(
             )
     # the score of colmap_process/scores.py; both attempts have the same number of photos
     model, report = max(found, key=lambda pair: pair[1].explained * pair[1].registered)
-    if report.registered < _ENOUGH * len(copies):
+    if report.registered < MIN_POSED_SHARE * len(copies):
         raise ValueError(
             f"{photos.paths[0].parent}: expected at least half of {len(copies)} photos to register, "
             f"found {report.registered}; {_ADVICE}; without a pose: {', '.join(map(str, report.missing))}"

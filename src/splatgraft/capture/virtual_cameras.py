@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.capture.usable_views import MIN_VIEWS
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.directions import perpendicular
 from splatgraft.core.gaussians import Gaussians
@@ -28,7 +29,6 @@ from splatgraft.runtime.note import Note
 from splatgraft.runtime.progress import Progress, silent
 
 _HALF_FOV = math.radians(30)  # half the horizontal field of view, radians
-_MIN_VIEWS = 8  # smallest number of views; the least occluded ones are added if too few are free
 
 # solid Gaussians and floor planes
 _MIN_OPACITY = 0.3  # smallest opacity of a solid Gaussian
@@ -74,8 +74,8 @@ class VirtualCameraOptions:
 
     def __post_init__(self) -> None:
         """Raise a ValueError if there are too few views, pictures are too small, or up has no length."""
-        if self.views < _MIN_VIEWS:
-            raise ValueError(f"--views: expected at least {_MIN_VIEWS}, found {self.views}")
+        if self.views < MIN_VIEWS:
+            raise ValueError(f"--views: expected at least {MIN_VIEWS}, found {self.views}")
         if self.picture_width < 16:
             raise ValueError(f"--picture-width: expected at least 16, found {self.picture_width}")
         if self.up is not None and not math.hypot(*self.up) > 0:
@@ -236,7 +236,7 @@ def _unoccluded_poses(
 ) -> tuple[Float[Tensor, "v 4 4"], int]:
     """Choose the first position of each view that is not occluded, by rendering the scene at 48 x 36 pixels.
 
-    If fewer than `_MIN_VIEWS` views have one, the least occluded of the others are added.
+    If fewer than `MIN_VIEWS` views have one, the least occluded of the others are added.
 
     Returns:
         Poses, and the number of views without a free position.
@@ -251,7 +251,7 @@ def _unoccluded_poses(
         else:
             rejected.append(min(((occluded, pose) for pose, occluded in tried), key=lambda pair: pair[0]))
         progress(index + 1, len(views), "placing virtual cameras")
-    missing = max(0, _MIN_VIEWS - len(chosen))
+    missing = max(0, MIN_VIEWS - len(chosen))
     chosen += [pose for _, pose in sorted(rejected, key=lambda pair: pair[0])[:missing]]
     return torch.stack(chosen), len(rejected)
 

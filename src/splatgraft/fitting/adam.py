@@ -13,10 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from splatgraft.runtime.kernels import kernel, serialized
+from splatgraft.runtime.kernels import FAST_MATH, kernel, serialized
 
 BETA_1, BETA_2, EPSILON = 0.9, 0.999, 1e-15
-_FAST = {"contract", "nsz", "arcp", "reassoc"}
 _PART = 1024  # Gaussians per task of a thread
 
 
@@ -116,7 +115,7 @@ def _step_numba(rows: _Rows, steps: Int[Tensor, "n"], rates: _Rates, visible: Bo
     return _update_rows(values, gradients, (firsts, seconds), (steps.numpy(), visible.numpy()), numbers) == 0
 
 
-@kernel(fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=FAST_MATH, error_model="numpy")
 @no_type_check
 def bias_corrections(step):
     """Compute the factors on the first and second moment after update number `step`, counted from 1."""
@@ -128,7 +127,7 @@ def bias_corrections(step):
 
 
 # divisions follow numpy, because a check for zero would be a branch in the loop
-@kernel(fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=FAST_MATH, error_model="numpy")
 @no_type_check
 def update_row(value, gradient, moments, corrections, rate):
     """Update one Gaussian's row of a field in place; return 1 and change nothing if a gradient is not finite."""

@@ -23,7 +23,10 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.fitting.gaussian_fit import FitState, Step
 from splatgraft.rendering import view_operator
 
-# set by hand where no source is named
+ERROR_EVERY = 4
+"""Usual number of steps between two measurements of the error that each Gaussian covers."""
+
+# set by hand unless a source is named
 _DEAD_OPACITY = 0.005  # opacity below which a Gaussian is removed (3DGS, Sec. 5)
 _SHIFT = 0.5  # distance of the children from the parent's centre, in the parent's longest standard deviation
 _LONG_SCALE = math.sqrt(1 - _SHIFT**2)  # width of a child along the split axis, over the parent's; keeps the variance

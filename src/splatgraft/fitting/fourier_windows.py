@@ -15,7 +15,7 @@ from numba import float32
 from torch import Tensor
 
 from splatgraft.rendering.cpu_simd import broadcast, load, store
-from splatgraft.runtime.kernels import kernel, serialized
+from splatgraft.runtime.kernels import FAST_MATH, kernel, serialized
 
 SIZE = 16
 _HOP, _ROWS = SIZE // 2, SIZE // 2 + 1
@@ -24,7 +24,6 @@ _ANGLES = 2 * math.pi / SIZE * (np.arange(SIZE)[:, None] * np.arange(SIZE) % SIZ
 _COS, _SIN = np.cos(_ANGLES).astype(np.float32).ravel(), np.sin(_ANGLES).astype(np.float32).ravel()
 _SHARES = np.repeat(np.array([1, *[2] * (_ROWS - 2), 1], np.float32) / SIZE, SIZE)
 """Multiplicity of each number of the half spectrum in the full one, over 16."""
-_FAST = {"contract", "nsz", "arcp", "reassoc"}
 _ZERO = np.float32(0)
 
 
@@ -94,7 +93,7 @@ def _transform(picture, place, factors, tables, work, spectrum):
         store(spectrum, _HALF + row * SIZE, imaginary)
 
 
-@kernel(fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=FAST_MATH, error_model="numpy")
 @no_type_check
 def _differ(spectrum, wanted, shares):
     """Return the sum of absolute differences of magnitudes; `spectrum` becomes the gradient of that sum."""

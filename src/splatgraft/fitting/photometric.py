@@ -13,14 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.image_metrics import ssim
-from splatgraft.runtime.kernels import kernel, serialized
+from splatgraft.runtime.kernels import FAST_MATH, kernel, serialized
 
 _TAPS = np.exp(-((np.arange(6, dtype=np.float64) - 5) ** 2) / (2 * 1.5**2))
 _T0, _T1, _T2, _T3, _T4, _T5 = (np.float32(tap) for tap in _TAPS / (2 * _TAPS.sum() - _TAPS[5]))
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
 _ONE, _TWO = np.float32(1), np.float32(2)
 _BLOCK, _BAND, _EDGE = 512, 64, 30  # values per block, rows per task, values of ten pixels with three channels
-_FAST = {"contract", "nsz", "arcp", "reassoc"}
 
 
 def l1_dssim(
@@ -54,7 +53,7 @@ class _FusedL1Dssim(torch.autograd.Function):
         return upstream * ctx.saved_tensors[0], None, None
 
 
-@kernel(fastmath=_FAST)
+@kernel(fastmath=FAST_MATH)
 @no_type_check
 def _across(out, row):
     """Set out[j] to the weighted sum of one channel of eleven neighbours: row[j], row[j + 3], ..."""
@@ -69,14 +68,14 @@ def _across(out, row):
         )
 
 
-@kernel(fastmath=_FAST)
+@kernel(fastmath=FAST_MATH)
 @no_type_check
 def _add_rows(out, first, second, tap):
     for j in range(len(out)):
         out[j] += tap * (first[j] + second[j])
 
 
-@kernel(fastmath=_FAST)
+@kernel(fastmath=FAST_MATH)
 @no_type_check
 def _down(out, ring, k, top):
     """Set `out` to the weighted sum of plane k of the eleven rows from `top` on; row r is at r modulo 11 of `ring`."""
@@ -90,7 +89,7 @@ def _down(out, ring, k, top):
 
 
 # divisions follow numpy, because a check for zero would be a branch in the loop; denominators are at least C1 and C2
-@kernel(fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=FAST_MATH, error_model="numpy")
 @no_type_check
 def _similarity(work):
     """Return the sum of SSIM and replace filtered moments by SSIM's derivatives, in planes of `_BLOCK` values.
@@ -112,7 +111,7 @@ def _similarity(work):
     return total
 
 
-@kernel(fastmath=_FAST)
+@kernel(fastmath=FAST_MATH)
 @no_type_check
 def _moments_of_row(out, x, y):
     """Write horizontally filtered x, y, x^2 + y^2 and xy to out[0..3]."""
@@ -127,7 +126,7 @@ def _moments_of_row(out, x, y):
     _across(out[3], scratch)
 
 
-@kernel(fastmath=_FAST)
+@kernel(fastmath=FAST_MATH)
 @no_type_check
 def _derivatives_of_row(out, filtered, top):
     """Return the sum of SSIM over one row, and write its horizontally spread derivatives to out[0..2]."""
@@ -151,7 +150,7 @@ def _derivatives_of_row(out, filtered, top):
     return total
 
 
-@kernel(fastmath=_FAST)
+@kernel(fastmath=FAST_MATH)
 @no_type_check
 def _gradient_of_row(out, spread, row, pair, scales):
     """Spread the derivatives vertically, add those of L1, and return the sum of |x - y|."""
@@ -174,7 +173,7 @@ def _gradient_of_row(out, spread, row, pair, scales):
 
 
 @serialized
-@kernel(parallel=True, fastmath=_FAST)
+@kernel(parallel=True, fastmath=FAST_MATH)
 @no_type_check
 def _loss_and_gradient(x, y, weight):
     """Compute the loss and its gradient for images as rows of three interleaved channels.

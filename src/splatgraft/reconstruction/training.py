@@ -17,7 +17,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.fitting.density import DensityControl
+from splatgraft.fitting.density import ERROR_EVERY, DensityControl
 from splatgraft.fitting.gaussian_fit import FitOptions, FitState, LearningRates, Step, fit
 from splatgraft.fitting.surface_loss import SurfaceLoss
 from splatgraft.reconstruction.image_pyramid import read_pyramid
@@ -44,7 +44,6 @@ _PUBLISHED_OPACITY, _SHORT_RUN_OPACITY = 0.1, 0.5  # initial opacity at the publ
 _BAND_SHARE = 30  # number of steps over the steps between two bands of colour
 _DENSIFY_EVERY, _MIN_DENSIFICATIONS = 100, 20  # most steps between densifications (3DGS), and fewest densifications
 _FULL_AT, _STOP_AT = 0.6, 0.8  # shares of the steps at which the budget is reached, and after which density is fixed
-_ERROR_EVERY = 4  # steps between measurements of the error that each Gaussian covers
 _MEANS_POWER, _MAX_MEANS = 0.5, 4.0  # factor on the rate of the centres: (published / own length)^power, and its bound
 _OTHERS_POWER, _MAX_OTHERS = 0.6, 8.0  # the same for all other rates
 _COLOR_RATE = 0.003  # learning rate of each photograph's own affine map of colours
@@ -89,7 +88,7 @@ def reconstruct(
         full_at=int(_FULL_AT * options.all_iterations),
         stop=int(_STOP_AT * options.all_iterations),
         camera_centers=capture.cameras.centers.to(options.device),
-        error_every=_ERROR_EVERY if options.beyond_draft else 0,
+        error_every=ERROR_EVERY if options.beyond_draft else 0,
     )
     band_every = max(1, options.all_iterations // _BAND_SHARE)
 

@@ -10,6 +10,8 @@ from typing import Any
 
 import numba
 
+FAST_MATH = {"contract", "nsz", "arcp", "reassoc"}
+"""LLVM's fast-math flags that keep nan and infinity."""
 KERNEL_LOCK = threading.Lock()
 """Held while a kernel runs: without OpenMP numba uses its workqueue layer, which aborts the process when two threads
 start kernels at the same time."""

@@ -29,7 +29,7 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.prompts import ViewPrompt
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.rendering import surface_points
-from splatgraft.segmentation.selection import Box
+from splatgraft.segmentation.selection import SURFACE_OPACITY, Box
 
 _WHOLE_VIEWS = 0.75  # share of the images that show the whole sphere around the middle
 _FAR_RADIUS = 0.25  # radius of that sphere over the cameras' median distance, if they show no whole sphere
@@ -49,7 +49,6 @@ _MARGIN = 0.2  # margin at each end, over the longest edge: parts without textur
 _REACH = 0.1  # largest distance of the object's Gaussians from the group of points, over the box's longest edge
 _BEYOND = 1.2  # factor on the box's edges that contains all of the object
 _LEVEL_NORMAL_Z = 0.99  # smallest z of the support's normal at which the box ends above the support
-_MIN_OPACITY = 0.3  # smallest opacity of a surface Gaussian
 _COLOR_STEP = 2.0  # colour difference that doubles a path's length, over the median of neighbours (texture, noise)
 _NEIGHBOURS = 10  # nearest Gaussians to which paths lead
 _TOUCHED = 6  # Gaussians nearest to a user's point, which certainly belong to its side
@@ -106,7 +105,7 @@ def seed_selection(
         ValueError: The region has no solid Gaussian.
     """
     prompts = prompts or {}
-    opaque = scene.opacities > _MIN_OPACITY
+    opaque = scene.opacities > SURFACE_OPACITY
     inside, outside = (_points_on_surface(scene, cameras, prompts, which) for which in ("inside", "outside"))
     framed = _framed(scene.means, cameras, prompts)
     if box is not None:

@@ -15,6 +15,8 @@ from splatgraft.core.gaussians import Gaussians
 
 Keep = Literal["substantial", "largest", "all"]
 
+SURFACE_OPACITY = 0.3
+"""Opacity above which a Gaussian counts as a surface; set by hand."""
 _SUBSTANTIAL = 0.05  # smallest summed opacity of a substantial component, over the largest one's; set by hand
 _NEIGHBOURS = 16  # nearest Gaussians that are tested for contact with each Gaussian
 

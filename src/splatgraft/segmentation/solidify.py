@@ -22,7 +22,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.fitting.density import DensityControl
+from splatgraft.fitting.density import ERROR_EVERY, DensityControl
 from splatgraft.fitting.gaussian_fit import FitOptions, LearningRates, View, fit
 from splatgraft.fitting.surface_loss import SurfaceLoss
 from splatgraft.rendering import RenderOptions, render, view_operator
@@ -30,7 +30,6 @@ from splatgraft.runtime.progress import Progress, silent
 
 _DENSIFICATIONS = 20  # number of densifications
 _FULL_AT, _STOP_AT = 0.6, 0.7  # shares of the steps at which the number is reached, and after which density is fixed
-_ERROR_EVERY = 4  # steps between measurements of the error that each Gaussian covers
 _STRIDE = 2  # distance of the fitted pixels along each axis
 _HIDDEN = 0.1  # visible pixels over a Gaussian's own area, relative to the median, below which its colour is unknown
 _NEIGHBOURS = 8  # Gaussians of known colour whose mean replaces an unknown one
@@ -151,7 +150,7 @@ def _density(chosen: Gaussians, views: Sequence[View], cameras: Cameras, options
         full_at=int(_FULL_AT * options.iterations),
         stop=int(_STOP_AT * options.iterations),
         camera_centers=cameras.centers,
-        error_every=_ERROR_EVERY,
+        error_every=ERROR_EVERY,
     )
 
 

@@ -23,6 +23,7 @@ from splatgraft.core.directions import frames_along, tangents
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.rendering import RenderOptions, view_operator
+from splatgraft.segmentation.selection import SURFACE_OPACITY
 
 # all set by hand
 _GRID = 96  # voxels along each axis
@@ -34,7 +35,6 @@ _PIECE = 0.02  # smallest share of the object's surface in a piece of the hull; 
 _FACING = 0.2  # smallest cosine between a surface's normal and the direction to a camera that sees it
 _MAX_VIEWS = 40  # most photographs that are used, evenly spaced in their order
 _BIAS = 2.5  # voxels between a point of the hull's surface and the hull's first voxel that may hide it
-_OPAQUE = 0.3  # smallest opacity of a surface Gaussian
 _INSET = 2.0  # depth of the new Gaussians inside the hull, voxels; unseen outlines make the hull wider than the object
 _OVERLAP = 4.0  # overlap of the new Gaussians with the seen surface, voxels; closes gaps
 _HIDDEN = 0.005  # largest share of a new Gaussian's area that may show in a photograph
@@ -91,7 +91,7 @@ def close_unseen_side(object_: Gaussians, cameras: Cameras, masks: Sequence[Floa
     asked = torch.linspace(0, len(cameras) - 1, min(_MAX_VIEWS, len(cameras))).round().long()
     cameras, masks = cameras[asked], [masks[i].cpu() for i in asked.tolist()]
     nothing = ClosedObject(object_, torch.zeros(object_.count, dtype=torch.bool), 0.0)
-    opaque = object_.opacities > _OPAQUE
+    opaque = object_.opacities > SURFACE_OPACITY
     hull = _carved(object_, cameras, masks, up) if bool(opaque.any()) else None
     if hull is None:
         return nothing
@@ -153,7 +153,7 @@ def _carved(
     lowest = float((object_.means @ up).quantile(_TRIMMED))
     room = _ROOM * float((ends[1] - ends[0]).max())
     low, high = ends[0] - room, ends[1] + room
-    surface = object_.means[object_.opacities > _OPAQUE]
+    surface = object_.means[object_.opacities > SURFACE_OPACITY]
     # the first pass finds the hull's extent, the second carves it finely
     for _ in range(2):
         voxel = (high - low) / _GRID

@@ -9,6 +9,8 @@ from pathlib import Path
 PHASES = ("features", "matching", "mapping", "refinement")
 MIN_TRACK = 3
 """Fewest photos that must see a reliable point; with two, any false match makes a point."""
+MIN_INLIERS = 30
+"""Fewest points, or verified matches with another photo, for a reliable pose (COLMAP: abs_pose_min_num_inliers)."""
 MAX_ERROR_PX = 1.5
 """Largest mean reprojection error of a reliable point, pixels."""
 

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from .job import MAX_ERROR_PX, MIN_TRACK
+from .job import MAX_ERROR_PX, MIN_INLIERS, MIN_TRACK
 
-_MIN_OBSERVATIONS = 30  # fewest points that a photo must see for its pose to count (COLMAP: abs_pose_min_num_inliers)
 ALIKE = 0.99
 """Smallest ratio of a score to the best one at which two models count as equally good."""
 
@@ -68,7 +67,7 @@ def explained_shares(matches: Matches, model: Any) -> dict[int, float]:
 
 def connected_photos(database: Path) -> int:
     """Count the photos that can get a pose because they have enough verified matches with another photo."""
-    return len({i for *pair, rows in read_matches(database) if len(rows) >= _MIN_OBSERVATIONS for i in pair})
+    return len({i for *pair, rows in read_matches(database) if len(rows) >= MIN_INLIERS for i in pair})
 
 
 def _count(matches: Matches) -> int:
@@ -94,7 +93,7 @@ def _seen_points(model: Any) -> dict[int, np.ndarray]:
         for i, image in model.images.items()
         if image.has_pose
     }
-    return {i: points for i, points in seen.items() if (points >= 0).sum() >= _MIN_OBSERVATIONS}
+    return {i: points for i, points in seen.items() if (points >= 0).sum() >= MIN_INLIERS}
 
 
 def _numbers(matches: Matches, model: Any) -> Answer:
