@@ -28,9 +28,9 @@ import torch
 from relight import courtyard, surfels
 from torch import Tensor
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.consolidation import ConsolidateOptions, consolidate
 from splatgraft.core.cameras import Cameras, look_at, pinhole
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import psnr

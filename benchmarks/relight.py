@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numba
 import torch
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.rotations import quaternion_from_rotation

@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.cameras import Cameras, look_at, pinhole
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along, vogel_offsets
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from splatgraft.compositing.composite import Composite, PlacedObject
     from splatgraft.composition import Placed, PlaceOptions, compose, place_object
     from splatgraft.consolidation import ConsolidateOptions, consolidate
     from splatgraft.core.cameras import Cameras, look_at, pinhole
-    from splatgraft.core.composite import Composite, PlacedObject
     from splatgraft.core.gaussians import Gaussians
     from splatgraft.core.images import read_rgb as load_image
     from splatgraft.core.images import write_image as save_image

@@ -5,8 +5,8 @@ from dataclasses import fields, replace
 import torch
 from shapes import UP, surfels
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.splitting import split_wide_around

@@ -7,8 +7,8 @@ import pytest
 import torch
 from shapes import ring, surfels
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import concatenate
 from splatgraft.core.similarity import Similarity

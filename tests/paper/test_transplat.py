@@ -6,7 +6,7 @@ import pytest
 import torch
 from shapes import ring, surfels
 
-from splatgraft.core.composite import Composite, PlacedObject
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import rgb_from_dc

@@ -9,11 +9,11 @@ import torch
 from shapes import UP, ring, sunlit_scene, surfels
 
 from splatgraft.cli import main
+from splatgraft.compositing.composite import PlacedObject
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.capture_orientation import estimate_up, focus_point
-from splatgraft.core.composite import PlacedObject
 from splatgraft.core.directions import even_directions, fit_sh
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear

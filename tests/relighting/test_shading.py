@@ -10,7 +10,6 @@ from shapes import UP, ring, surfels
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, empty
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear

@@ -11,9 +11,9 @@ import pytest
 import torch
 from shapes import ring, surfels
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras, look_at, pinhole
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb

@@ -8,8 +8,8 @@ import pytest
 import torch
 from shapes import ring, surfels
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.bounds import bounding_sphere
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.exposure import LuminanceScale
 from splatgraft.core.gaussians import Gaussians, concatenate, empty

@@ -1,5 +1,6 @@
 """Composition: places objects in a target scene, by given transforms or on a surface that is found for them."""
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.composition.coverage import Coverage
 from splatgraft.composition.object_base import ObjectBase, object_base, rest_on_surface
 from splatgraft.composition.placement import Placed, PlaceOptions, compose, place_object
@@ -7,7 +8,6 @@ from splatgraft.composition.places import NoFreePlaceError, Suggestion, suggest_
 from splatgraft.composition.support_surface import Support, support_below
 from splatgraft.composition.visibility import hidden_fraction
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.core.composite import Composite, PlacedObject
 
 __all__ = [
     "Composite",

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.composition.coverage import Coverage
 from splatgraft.composition.object_base import ObjectBase, object_base, rest_on_surface
 from splatgraft.composition.places import Suggestion, scale_in_view, suggest_places
@@ -25,7 +26,6 @@ from splatgraft.composition.support_surface import Support, support_below
 from splatgraft.composition.visibility import hidden_fraction
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.directions import tangents
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.memo import Memo
 from splatgraft.editor.scene_cache import SceneCache

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from splatgraft.compositing.composite import Composite
 from splatgraft.composition import compose, object_base
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.editor.memo import Memo

@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from splatgraft.compositing.composite import Composite
 from splatgraft.core import spherical_harmonics
-from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
 from splatgraft.core.splitting import split_wide_around

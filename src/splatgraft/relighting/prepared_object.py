@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.compositing.composite import PlacedObject
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.core.composite import PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting.captured_scene import CapturedScene

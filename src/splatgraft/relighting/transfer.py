@@ -12,9 +12,9 @@ estimated, and colours are multiplied by ratios of irradiance. Each step is one 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from splatgraft.compositing.composite import Composite
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.composite import Composite
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.cast_shadows import cast_shadows
 from splatgraft.relighting.layers import Relit, assemble_layers, pasted

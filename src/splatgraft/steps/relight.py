@@ -7,8 +7,8 @@ from typing import ClassVar, Literal
 
 import torch
 
+from splatgraft.compositing.composite import Composite
 from splatgraft.core.bounds import bounding_sphere
-from splatgraft.core.composite import Composite
 from splatgraft.core.images import write_image
 from splatgraft.folders.capture_files import camera_files, read_luminance_scale
 from splatgraft.folders.composite_folder import placement_files, read_composite

@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.light.panorama import NoLight, Panorama, panorama_at
 from splatgraft.relighting.prepared_object import SourceScene

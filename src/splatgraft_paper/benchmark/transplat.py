@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.bounds import bounding_sphere
-from splatgraft.core.composite import Composite, PlacedObject
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting import SourceScene
 from splatgraft.relighting.light.panorama import NoLight, Panorama, panorama_at

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from splatgraft.compositing.contact import flatten_contact_layers
 from splatgraft.consolidation import ConsolidateOptions, consolidate
-from splatgraft.core.contact import flatten_contact_layers
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear, write_image

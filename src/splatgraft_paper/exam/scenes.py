@@ -13,8 +13,8 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from splatgraft.compositing.composite import Composite
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.composite import Composite
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages, held_out
 from splatgraft.evaluation import Truth

@@ -6,9 +6,9 @@ import pytest
 import torch
 from shapes import UP, surfels
 
+from splatgraft.compositing.composite import Composite, PlacedObject
+from splatgraft.compositing.contact import flatten_contact_layers
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.composite import Composite, PlacedObject
-from splatgraft.core.contact import flatten_contact_layers
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate, empty
 from splatgraft.core.rotations import rotation_about

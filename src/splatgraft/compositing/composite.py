@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from splatgraft.core.contact import flatten_contact_layers
+from splatgraft.compositing.contact import flatten_contact_layers
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.splitting import split_wide_around
