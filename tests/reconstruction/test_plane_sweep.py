@@ -55,6 +55,18 @@ def test_plain_ground_between_known_points_is_found_at_their_plane():
     assert int(on_floor.sum()) > 0.5 * len(found) > 300
 
 
+def test_known_points_on_one_line_of_an_image_give_no_depth_between_them():
+    _, images = views_of_a_floor()
+    # in the row through the centre of the first image, at depths 3 to 5
+    x, z = torch.linspace(-1, 1, 8), torch.linspace(3, 5, 8)
+    known = torch.stack([x * z, torch.zeros(8), z], 1)
+    beside = torch.eye(4)
+    beside[0, 3] = 0.5
+    cameras = list(camera_values.pinhole(torch.stack([torch.eye(4), beside]), 80.0, width=96, height=64))
+    found = sweep(cameras, images[:2], known=known, reach=DISTANCE)
+    assert torch.isfinite(found.points).all()
+
+
 def test_points_that_one_view_alone_shows_are_left_out():
     cameras, images = views_of_a_floor()
     images[0] = images[0].roll(24, dims=1)

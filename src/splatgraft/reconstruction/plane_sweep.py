@@ -15,8 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import QhullError
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
@@ -75,7 +76,7 @@ def sweep(
     ]
     found = SeedPoints.none()
     for points, others in zip(candidates, compared, strict=True):
-        votes = sum((_agrees(points.points, cameras[j], surfaces[j]) for j in others), torch.zeros(len(points)))
+        votes = sum((_agree(points.points, cameras[j], surfaces[j]).int() for j in others), torch.zeros(len(points)))
         found = found.joined(points.select(votes >= _AGREEING_VIEWS))
     return found
 
@@ -107,36 +108,34 @@ class _Cells:
 
     def depth_map(self) -> Float[Tensor, "rows columns"]:
         """Return the depth of the nearest point of each cell; infinite without one."""
-        return (
-            torch.where(self.nearest >= 0, self.depths[self.nearest], torch.inf)
-            if len(self.depths)
-            else (torch.full(self.nearest.shape, torch.inf))
-        )
+        return torch.cat([self.depths, torch.tensor([torch.inf])])[self.nearest]  # -1 is the last
 
     def interpolated_depth(self, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, "k"]:
         """Interpolate inverse depth over the Delaunay triangles of the nearest points; infinite outside of them."""
         corners = self.nearest[self.nearest >= 0]
-        if len(corners) < 4:  # fewest that surely have a triangle in Qhull
-            return torch.full((len(pixels),), torch.inf)
-        inverse = LinearNDInterpolator(self.pixels[corners].numpy(), 1 / self.depths[corners].numpy(), fill_value=0)
+        nowhere = torch.full((len(pixels),), torch.inf)
+        if len(corners) < 3:
+            return nowhere
+        try:
+            inverse = LinearNDInterpolator(self.pixels[corners].numpy(), 1 / self.depths[corners].numpy(), fill_value=0)
+        except QhullError:  # all points lie on one line
+            return nowhere
         return 1 / torch.from_numpy(inverse(pixels.numpy())).float()
 
 
-def _agrees(
-    points: Float[Tensor, "m 3"], camera: Cameras, surface: Float[Tensor, "rows columns"]
-) -> Float[Tensor, "m"]:
-    """Return 1 for points with the depth of `surface` in their cell or a neighbouring one, else 0."""
+def _agree(points: Float[Tensor, "m 3"], camera: Cameras, surface: Float[Tensor, "rows columns"]) -> Bool[Tensor, "m"]:
+    """Test which points have the depth of `surface` in their cell or a neighbouring one."""
     pixels, depths = _project(points, camera)
     rows, columns = surface.shape
-    # one more cell on each side, so that points out of view find no surface
+    # a point out of view is taken to the next cell outside, whose neighbours are padded, too
     padded = torch.nn.functional.pad(surface, (2, 2, 2, 2), value=torch.inf)
-    place = (pixels / _CELL_PX).floor().nan_to_num(-2).clamp(-1, max(rows, columns)).long() + 2
-    x, y = place[:, 0].clamp_max(columns + 2), place[:, 1].clamp_max(rows + 2)
+    x, y = (pixels / _CELL_PX).floor().unbind(-1)
+    x, y = x.clamp(-1, columns).long() + 2, y.clamp(-1, rows).long() + 2
     same = torch.zeros(len(points), dtype=torch.bool)
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
             same |= (depths / padded[y + dy, x + dx] - 1).abs() < _SAME_DEPTH
-    return (same & (depths > 0)).float()
+    return same & (depths > 0)
 
 
 def _points_of_view(
