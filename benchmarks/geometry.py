@@ -99,7 +99,7 @@ _COLUMNS = {
     "cpu_seconds": ("CPU s", 1, 0),
     "gaussians": ("Gaussians", 1, 0),
 }
-"""Of each field of `Row` in the table: its title, the factor on it, and the decimals."""
+"""Columns of the table by field of `Row`: title, factor on the value, decimals."""
 
 
 def depth_error(rendered: Float[Tensor, "h w"], truth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

@@ -94,7 +94,7 @@ def timed(scene: Gaussians, capture: PosedImages, options: LiftOptions) -> tuple
     return feature, time.perf_counter() - wall, time.process_time() - cpu
 
 
-def mean_iou(scene: Gaussians, chosen: Bool[Tensor, "n"], tests: PosedImages) -> float:
+def mean_iou(scene: Gaussians, chosen: Bool[Tensor, " n"], tests: PosedImages) -> float:
     scores = []
     for camera, mask in zip(tests.cameras, masks_of(tests), strict=True):
         shown = view_operator(scene, camera, RenderOptions()).blend(chosen.float()[:, None])[..., 0] > 0.5

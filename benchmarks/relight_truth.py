@@ -124,7 +124,7 @@ def disk(direction: Tensor, radius_deg: float, count: int) -> Float[Tensor, "n 3
     return vogel_offsets(direction, (1 - cosine**2).sqrt(), i) + cosine[:, None] * direction
 
 
-def true_ratio(shape: Ball | Box, light: Light, points: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
+def true_ratio(shape: Ball | Box, light: Light, points: Float[Tensor, "m 3"]) -> Float[Tensor, " m"]:
     """Return irradiance on the plane with the object over irradiance without it, by ray casting."""
     hemisphere = even_directions(8192)
     hemisphere = hemisphere[hemisphere[:, 2] > 0]

@@ -30,7 +30,7 @@ OPTIONS = ReconstructOptions(iterations=1000, budget=20_000)
 _MARGIN_PX = 2
 
 
-def halves(capture: PosedImages) -> tuple[PosedImages, Int[Tensor, "a"], Int[Tensor, "b"]]:
+def halves(capture: PosedImages) -> tuple[PosedImages, Int[Tensor, " a"], Int[Tensor, " b"]]:
     """Return the capture from one half circle around the subject, its photographs, and the other photographs.
 
     Points on the other side are removed too, because the remaining photographs do not show them.
@@ -38,7 +38,7 @@ def halves(capture: PosedImages) -> tuple[PosedImages, Int[Tensor, "a"], Int[Ten
     tangent, bitangent = tangents(estimate_up(capture.cameras))
     focus = focus_point(capture.cameras)
 
-    def is_kept(places: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    def is_kept(places: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
         away = places - focus
         return torch.remainder(torch.atan2(away @ bitangent, away @ tangent) - first, 2 * torch.pi) < torch.pi
 
@@ -56,7 +56,7 @@ def on_black(capture: PosedImages, index: int) -> tuple[Float[Tensor, "h w 3"], 
     return capture.image(index) * mask[..., None], mask
 
 
-def mean_psnr(object_: Gaussians, capture: PosedImages, which: Int[Tensor, "n"]) -> float:
+def mean_psnr(object_: Gaussians, capture: PosedImages, which: Int[Tensor, " n"]) -> float:
     """Return the PSNR over some photographs, inside the widened mask."""
     found = []
     for index in which.tolist():

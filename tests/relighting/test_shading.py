@@ -7,6 +7,7 @@ import pytest
 import torch
 from shapes import UP, ring, surfels
 
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import look_at, pinhole

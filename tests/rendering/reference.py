@@ -17,7 +17,7 @@ MIN_ALPHA, MAX_ALPHA = 1 / 255, 0.99
 
 def projection(
     gaussians: Gaussians, camera: Cameras, options: RenderOptions
-) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Return centres in pixels, covariances in pixels^2 after the low-pass, opacities, depths."""
     pose, k = camera.camera_from_world[0].to(gaussians.means), camera.intrinsics[0].to(gaussians.means)
     x_in_camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
@@ -57,7 +57,7 @@ def covariance_on_screen(gaussians: Gaussians, camera: Cameras) -> Float[Tensor,
 
 def inverse_depths(
     gaussians: Gaussians, camera: Cameras, options: RenderOptions
-) -> tuple[Float[Tensor, "h w n"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, "h w n"], Float[Tensor, " n"]]:
     """Return the mean of each Gaussian's inverse depth in each pixel, and its variance there."""
     center, blurred, _, depth = projection(gaussians, camera, options)
     covariance = covariance_on_screen(gaussians, camera)
@@ -73,7 +73,7 @@ def inverse_depths(
 
 def weights(
     gaussians: Gaussians, camera: Cameras, options: RenderOptions
-) -> tuple[Float[Tensor, "h w m"], Float[Tensor, "m"]]:
+) -> tuple[Float[Tensor, "h w m"], Float[Tensor, " m"]]:
     """Return the weight of every Gaussian in every pixel, nearest first, and the Gaussians' indices in that order."""
     center, covariance, opacity, depth = projection(gaussians, camera, options)
     order = torch.argsort(depth.detach(), stable=True)

@@ -15,9 +15,10 @@ from scipy import ndimage
 from torch import Tensor
 
 from splatgraft.composition.support_surface import HeightMap, height_map
-from splatgraft.composition.visibility import visible_share
+from splatgraft.composition.visibility import VIEWS, project, small_cameras, visible_points, visible_share
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.rendering import render
 
 # set by hand; lengths over the half width of the map
 _MAP_SIZE_PX = 128  # width and height of the height map
@@ -35,6 +36,8 @@ FLAT_SLOPE = 0.08
 """Height difference that counts as level, over the radius of a disc: noise and a slope of a few degrees."""
 FLAT_ENOUGH = 0.8
 """Share of a disc that lies at the level of its middle, above which the disc counts as level."""
+_PICTURE_PX = 640  # longest side of the picture of free places
+_FREE, _TAKEN = (0.20, 0.75, 0.30), (0.85, 0.20, 0.15)  # sRGB
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,29 @@ def measure_ground(
         visible=visible.reshape(rise.shape),
         central=central,
     )
+
+
+def draw_ground(target: Gaussians, ground: Ground, *, cameras: Cameras) -> Float[Tensor, "h w 3"]:
+    """Draw the view of the camera that shows most of the support; level places are green, things on it red."""
+    surface, views = ground.surface, cameras.spread(VIEWS)
+    points, slack = surface.points[ground.support], 3 * surface.pixel
+    shown = [int(visible_points(target, points, camera=c, slack=slack).sum()) for c in small_cameras(views)]
+    camera = views[shown.index(max(shown))].limited(_PICTURE_PX)
+    drawn = render(target, camera, outputs=frozenset({"color", "depth"}))
+    color, depth = drawn.color[0].detach(), drawn.depth[0].detach()
+    below_map, pixels, inside = project(camera.unproject(depth).reshape(-1, 3), surface.camera)
+    last = len(surface.heights) - 1
+    at = (pixels[:, 1].long().clamp(0, last), pixels[:, 0].long().clamp(0, last))
+    plane_below_map = project(surface.points.reshape(-1, 3), surface.camera)[0].view_as(ground.rise) + ground.rise
+    rise = plane_below_map[at] - below_map
+    small = 2 * surface.pixel
+    level = level_share(surface, radius=small, tolerance=FLAT_SLOPE * small) > FLAT_ENOUGH
+    free = (ground.support & level & (ground.visible > 0))[at] & (rise.abs() <= ground.tolerance)
+    taken = ground.taken[at] & (rise > -ground.tolerance)
+    for marked, tint in ((free, _FREE), (taken, _TAKEN)):
+        part = (marked & inside).view(depth.shape) & (depth > 0)
+        color = torch.where(part[..., None], 0.5 * color + 0.5 * torch.tensor(tint), color)
+    return color
 
 
 def _rise_above_support(

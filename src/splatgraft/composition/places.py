@@ -12,8 +12,7 @@ from functools import cache, partial
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from splatgraft.composition.ground import FLAT_ENOUGH, FLAT_SLOPE, Ground, level_share, measure_ground
-from splatgraft.composition.ground_picture import draw_ground
+from splatgraft.composition.ground import FLAT_ENOUGH, FLAT_SLOPE, Ground, draw_ground, level_share, measure_ground
 from splatgraft.composition.object_base import ObjectBase
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up, focus_point

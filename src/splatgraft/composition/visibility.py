@@ -73,11 +73,7 @@ def project(
     points: Float[Tensor, "m 3"], camera: Cameras
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m 2"], Bool[Tensor, "m"]]:
     """Compute the depth and the pixel of each point, and whether it lies inside the camera's image."""
-    pose = camera.camera_from_world[0].to(points)
-    in_camera = points @ pose[:3, :3].T + pose[:3, 3]
-    depth = in_camera[:, 2]
-    intrinsics = camera.intrinsics[0].to(points)
-    pixels = (in_camera @ intrinsics.T)[:, :2] / depth.clamp_min(1e-9)[:, None]
+    pixels, depth = camera.project(points)
     size = camera.sizes[0].to(points)
     inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
     return depth, pixels.nan_to_num(0).clamp(-1e6, 1e6), inside
