@@ -17,9 +17,9 @@ UP = torch.tensor([0.0, 0.0, 1.0])
 
 def loss(inverse: torch.Tensor, image: torch.Tensor, *, unit: float = 1.0):
     """Return the loss of opaque pixels with one depth each, mean over many draws."""
-    moments, alpha = torch.stack([inverse, inverse.square()], -1), torch.ones_like(inverse)
+    alpha = torch.ones_like(inverse)
     draws = [torch.Generator().manual_seed(i) for i in range(64)]
-    return torch.stack([SurfaceLoss(unit).loss(moments, alpha, image, generator=one) for one in draws]).mean()
+    return torch.stack([SurfaceLoss(unit).loss(inverse, alpha, image, generator=one) for one in draws]).mean()
 
 
 def sheet(slope_x: float, slope_y: float, offset: float = 1.0) -> torch.Tensor:

@@ -55,20 +55,18 @@ def covariance_on_screen(gaussians: Gaussians, camera: Cameras) -> Float[Tensor,
     return to_screen @ gaussians.covariances @ to_screen.transpose(1, 2)
 
 
-def inverse_depths(
-    gaussians: Gaussians, camera: Cameras, options: RenderOptions
-) -> tuple[Float[Tensor, "h w n"], Float[Tensor, " n"]]:
-    """Return the mean of each Gaussian's inverse depth in each pixel, and its variance there."""
+def inverse_depths(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> Float[Tensor, "h w n"]:
+    """Return the mean of each Gaussian's inverse depth in each pixel."""
     center, blurred, _, depth = projection(gaussians, camera, options)
     covariance = covariance_on_screen(gaussians, camera)
     slope = torch.einsum("nij,nj->ni", torch.linalg.inv(blurred), covariance[:, :2, 2])
     y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
     away = torch.stack([x, y], -1)[:, :, None].to(center) - center
-    mean, variance = 1 / depth + (away * slope).sum(-1), covariance[:, 2, 2] - (slope * covariance[:, :2, 2]).sum(1)
+    mean = 1 / depth + (away * slope).sum(-1)
     # no gradient if the centre is out of view, because the plane is extrapolated there
     size = camera.sizes[0].to(center)
     shown = ((center > -0.15 * size) & (center < 1.15 * size)).all(1)
-    return torch.where(shown, mean, mean.detach()), torch.where(shown, variance, variance.detach())
+    return torch.where(shown, mean, mean.detach())
 
 
 def weights(
@@ -98,7 +96,7 @@ def render(
 ) -> Render:
     """Return every output for one camera; `visible` marks Gaussians with weight in a pixel."""
     weight, order = weights(gaussians, camera, options)
-    inverse, variance = (x[..., order] for x in inverse_depths(gaussians, camera, options))
+    inverse = inverse_depths(gaussians, camera, options)[..., order]
     offset = gaussians.means - camera.centers[0].to(gaussians.means)
     colors = spherical_harmonics.colors(gaussians.sh, torch.nn.functional.normalize(offset, dim=-1))
     axis = gaussians.log_scales.detach().argmin(-1)
@@ -119,9 +117,7 @@ def render(
         pictures={
             "color": (weight @ colors[order] + (1 - alpha)[..., None] * background)[None],
             "depth": torch.where(covered[..., -1] > 0.5, 1 / middle, 0)[None].detach(),
-            "inverse_depth": torch.stack(
-                [(weight * inverse).sum(-1), (weight * (inverse.square() + variance)).sum(-1)], -1
-            )[None],
+            "inverse_depth": (weight * inverse).sum(-1)[None],
             "normal": torch.nn.functional.normalize(blended_normal, dim=-1)[None],
             "features": (weight @ features[order])[None],
         },

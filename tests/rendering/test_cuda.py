@@ -46,13 +46,13 @@ def test_pictures_and_gradients_match_the_cpu(low_pass):
 
 @pytest.mark.parametrize("low_pass_px2", [0.3, 0.075])
 def test_planes_of_inverse_depth_are_those_of_the_kernels(low_pass_px2):
-    # pure torch, so it is tested without a GPU: the CPU blends it as features; compared with the CPU's own moments
+    # pure torch, so it is tested without a GPU: the CPU blends the planes as features
     options, view = RenderOptions(low_pass_px2=low_pass_px2), camera()
     scene, other = (random_scene(60, 0, seed=2).map(lambda t: t.requires_grad_()) for _ in range(2))
     ours = rendering.render(scene, view, outputs=frozenset({"inverse_depth"}), options=options).inverse_depth[0]
-    channels = cuda.moment_channels(other, view, options)
-    blended = rendering.render(other, view, outputs=frozenset(), features=channels, options=options)
-    theirs = cuda.moments(blended.features[0], view)
+    planes = cuda.inverse_depth_planes(other, view, options)
+    blended = rendering.render(other, view, outputs=frozenset(), features=planes, options=options)
+    theirs = (blended.features[0] * view.rays()[..., [2, 0, 1]]).sum(-1)
     # float32; sums of up to 0.4
     assert (theirs - ours).abs().max() < 1e-5
     pixel_weights = torch.randn(ours.shape, generator=torch.Generator().manual_seed(3))
@@ -60,12 +60,12 @@ def test_planes_of_inverse_depth_are_those_of_the_kernels(low_pass_px2):
     (pixel_weights * theirs).sum().backward()
     for name in ("means", "log_scales", "quaternions", "opacity_logits"):
         found, expected = getattr(scene, name).grad, getattr(other, name).grad
-        # nine sums of similar numbers instead of two, in float32
+        # three sums of similar numbers instead of one, in float32
         assert (found - expected).abs().max() < 1e-3 * expected.abs().max(), name
 
 
 @needs_gpu
-def test_moments_of_inverse_depth_match_the_cpu():
+def test_inverse_depth_matches_the_cpu():
     pytest.importorskip("gsplat")
     found = []
     for device in ["cpu", "cuda"]:

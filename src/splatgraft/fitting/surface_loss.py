@@ -12,11 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_FAINT = 1e-3  # smallest opacity by which a ray's moment is divided
+_FAINT = 1e-3  # smallest opacity by which inverse depth is divided
 _SOLID = 0.5  # opacity below which a pixel shows no surface
-_EDGE = (
-    0.04  # difference over two pixels, sRGB, above which a photograph is not plain; twice the noise of a phone's photo
-)
+_EDGE = 0.04  # smallest edge of a photograph, sRGB difference over two pixels; twice the noise of a phone's photo
 
 
 @dataclass(frozen=True)
@@ -30,7 +28,7 @@ class SurfaceLoss:
 
     def loss(
         self,
-        inverse_depth: Float[Tensor, "h w 2"],
+        inverse_depth: Float[Tensor, "h w"],
         alpha: Float[Tensor, "h w"],
         image: Float[Tensor, "h w 3"],
         *,
@@ -39,12 +37,12 @@ class SurfaceLoss:
         """Compute the loss, a mean over pixels; differentiable in `inverse_depth` and `alpha`.
 
         Args:
-            inverse_depth: Moments from `render`, per world unit and its square; only the first is used.
+            inverse_depth: Blended inverse depth from `render`, per world unit.
             alpha: Opacity of the pixels.
             image: The photograph, sRGB; its edges separate surfaces.
             generator: Draws the axis and the distance of the second difference.
         """
-        mean = self.unit * inverse_depth[..., 0] / alpha.clamp_min(_FAINT)
+        mean = self.unit * inverse_depth / alpha.clamp_min(_FAINT)
         return self.weight * _bend(mean, alpha, image, generator)
 
 

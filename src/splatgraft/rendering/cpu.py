@@ -82,7 +82,7 @@ class _TileLists:
     splats: np.ndarray
     """(m, 8) columns of `cpu_project`, in the order of `order`."""
     inverse_depths: np.ndarray
-    """(m, 4) depth columns of `cpu_project`, in the order of `order`; empty if no depth was requested."""
+    """(m, 3) depth columns of `cpu_project`, in the order of `order`; empty if no depth was requested."""
     start: np.ndarray
     """(tiles + 1,) begin of each tile's list in `entries`."""
     entries: np.ndarray
@@ -154,8 +154,8 @@ class _TileLists:
         cpu_blend.blend(self.splats, self.start, self.entries, self.rows, self.in_order(values), image, alpha, least)
         return image, alpha
 
-    def blend_with_moments(self, colors: np.ndarray, view: _View) -> tuple[np.ndarray, np.ndarray]:
-        """Blend `colors (n, 3)` and the moments of inverse depth to (5, h, w); gives alpha (h, w), too."""
+    def blend_with_inverse_depth(self, colors: np.ndarray, view: _View) -> tuple[np.ndarray, np.ndarray]:
+        """Blend `colors (n, 3)` and inverse depth to (4, h, w); gives alpha (h, w), too."""
         image = np.empty((cpu_depth.CHANNELS, view.height, view.width), np.float32)
         alpha = np.empty((view.height, view.width), np.float32)
         cpu_depth.blend(
@@ -206,7 +206,7 @@ class _RenderView(torch.autograd.Function):
                 cpu_project.normals(means, log_scales, quaternions, lists.drawn, view.numbers, columns[-1])
             values = np.concatenate([*columns, features], 1)
             if "inverse_depth" in outputs:
-                image, alpha = lists.blend_with_moments(values, view)
+                image, alpha = lists.blend_with_inverse_depth(values, view)
             else:
                 image, alpha = lists.blend(values, view, cpu_blend.MIN_TRANSMITTANCE)
             depth = lists.median_depth(view) if "depth" in outputs else np.empty((0, 0), np.float32)
@@ -229,12 +229,12 @@ class _RenderView(torch.autograd.Function):
         for name in CHANNEL_COUNTS:
             if name in ctx.outputs:
                 places[name], at = at, at + widths[name]
-        with_moments = (lists.inverse_depths,) if "inverse_depth" in places else ()
-        kernel = cpu_depth.blend_backward if with_moments else cpu_blend.blend_backward
+        inverse_depths = (lists.inverse_depths,) if "inverse_depth" in places else ()
+        kernel = cpu_depth.blend_backward if inverse_depths else cpu_blend.blend_backward
         with KERNEL_LOCK:
             sums = np.empty((len(lists.entries), at + ctx.saved_tensors[-1].shape[1]), np.float32)
             kernel(
-                lists.splats, lists.start, lists.entries, lists.slots, lists.in_order(values), *with_moments,
+                lists.splats, lists.start, lists.entries, lists.slots, lists.in_order(values), *inverse_depths,
                 image, alpha, _array(grad_image), _array(grad_alpha), sums, cpu_blend.MIN_TRANSMITTANCE,
             )  # fmt: skip
             totals = lists.sum_slots(sums)

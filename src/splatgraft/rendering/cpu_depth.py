@@ -1,9 +1,7 @@
-"""Depth on the CPU: the median depth of each pixel, and moments of inverse depth along each ray: numba kernels.
+"""Depth on the CPU: the median depth of each pixel, and colours with blended inverse depth: numba kernels.
 
 The inverse depth of a plane is linear in the pixel. So a flat Gaussian has the depth of its plane in every pixel that
-it covers (`inverse_depths` of `cpu_project.project`), not the depth of its centre. The moments are sums of w c and of
-w (c^2 + v), blended like colours in the same pass. w is a Gaussian's blending weight; c and v are the mean and the
-variance of its inverse depth.
+it covers (`inverse_depths` of `cpu_project.project`), not the depth of its centre.
 """
 
 from typing import no_type_check
@@ -27,7 +25,7 @@ from splatgraft.rendering.cpu_blend import (
     splat_shape,
     write_moments,
 )
-from splatgraft.rendering.cpu_project import ALONG_RAY, AT_CENTER, SLOPE_X, SLOPE_Y
+from splatgraft.rendering.cpu_project import AT_CENTER, SLOPE_X, SLOPE_Y
 from splatgraft.rendering.cpu_simd import (
     broadcast,
     lanes,
@@ -42,7 +40,7 @@ from splatgraft.rendering.cpu_simd import (
 from splatgraft.rendering.cpu_tiles import TILE
 from splatgraft.runtime.kernels import kernel
 
-CHANNELS = 5  # red, green, blue, and the two moments of inverse depth
+CHANNELS = 4  # red, green, blue, inverse depth
 _LEAST, _MOST = float32(1 / 4), float32(4)
 """Bounds on inverse depth, over the one at the centre: a wide splat's faint rim reaches beyond its plane's horizon."""
 
@@ -80,7 +78,7 @@ def median_depth(splats, start, entries, inverse_depths, depth):
 @kernel
 @no_type_check
 def _blend_tile(splats, entries, values, inverse_depths, x0, y0, work, least):
-    """Planes of `work`: transmittance, red, green, blue, two moments."""
+    """Planes of `work`: transmittance, red, green, blue, inverse depth."""
     for k in range(entries.shape[0]):
         s = entries[k]
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
@@ -88,19 +86,17 @@ def _blend_tile(splats, entries, values, inverse_depths, x0, y0, work, least):
         dx = lanes() - mx
         across = dx * dx * a + d
         plane_x = inverse_depths[s, AT_CENTER] + dx * inverse_depths[s, SLOPE_X]
-        slope_y, along = inverse_depths[s, SLOPE_Y], inverse_depths[s, ALONG_RAY]
+        slope_y = inverse_depths[s, SLOPE_Y]
         for y in range(top, bottom):
             dy = float32(y) - my
             at = y * TILE
             before = load(work, at)
             weight = smaller(alpha_row(across, dx, b * dy, c * dy * dy), MAX_ALPHA) * before
-            inverse = plane_x + slope_y * dy
             store(work, at, before - weight)
             store(work, at + PIXELS, load(work, at + PIXELS) + weight * red)
             store(work, at + 2 * PIXELS, load(work, at + 2 * PIXELS) + weight * green)
             store(work, at + 3 * PIXELS, load(work, at + 3 * PIXELS) + weight * blue)
-            store(work, at + 4 * PIXELS, load(work, at + 4 * PIXELS) + weight * inverse)
-            store(work, at + 5 * PIXELS, load(work, at + 5 * PIXELS) + weight * (inverse * inverse + along))
+            store(work, at + 4 * PIXELS, load(work, at + 4 * PIXELS) + weight * (plane_x + slope_y * dy))
         if k % BATCH == BATCH - 1 and saturated(work, least):
             break
 
@@ -108,9 +104,9 @@ def _blend_tile(splats, entries, values, inverse_depths, x0, y0, work, least):
 @kernel(parallel=True)
 @no_type_check
 def blend(splats, start, entries, values, inverse_depths, image, alpha, least):
-    """Fill `image (5, h, w)` with blended `values (m, 3)` and moments over black, and `alpha (h, w)`.
+    """Fill `image (4, h, w)` with blended `values (m, 3)` and inverse depth over black, and `alpha (h, w)`.
 
-    `inverse_depths (m, 4)`. A tile is done when every pixel's transmittance is below `least`.
+    `inverse_depths (m, 3)`. A tile is done when every pixel's transmittance is below `least`.
     """
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = open_tile(tile, alpha.shape[1], 1 + CHANNELS)
@@ -127,7 +123,7 @@ def blend(splats, start, entries, values, inverse_depths, image, alpha, least):
 @kernel
 @no_type_check
 def _backward_tile(splats, entries, slots, values, inverse_depths, x0, y0, work, sums, least):
-    """Planes of `work`: transmittance, rest, gradients of alpha, red, green, blue and the two moments."""
+    """Planes of `work`: transmittance, rest, gradients of alpha, red, green, blue and inverse depth."""
     for k in range(entries.shape[0]):
         s, slot = entries[k], slots[k]
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
@@ -135,10 +131,10 @@ def _backward_tile(splats, entries, slots, values, inverse_depths, x0, y0, work,
         dx = lanes() - mx
         across = dx * dx * a + d
         plane_x = inverse_depths[s, AT_CENTER] + dx * inverse_depths[s, SLOPE_X]
-        slope_y, along = inverse_depths[s, SLOPE_Y], inverse_depths[s, ALONG_RAY]
+        slope_y = inverse_depths[s, SLOPE_Y]
         s0, sy, syy = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
         sum_red, sum_green, sum_blue = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
-        sum_inverse, sum_inverse_y, sum_second = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)
+        sum_inverse, sum_inverse_y = broadcast(ZERO), broadcast(ZERO)
         for y in range(top, bottom):
             dy = float32(y) - my
             at = y * TILE
@@ -146,13 +142,10 @@ def _backward_tile(splats, entries, slots, values, inverse_depths, x0, y0, work,
             uncapped = alpha_row(across, dx, b * dy, c * dy * dy)
             alpha = smaller(uncapped, MAX_ALPHA)
             weight = alpha * before
-            inverse = plane_x + slope_y * dy
             to_red, to_green = load(work, at + 3 * PIXELS), load(work, at + 4 * PIXELS)
-            to_blue = load(work, at + 5 * PIXELS)
-            to_first, to_second = load(work, at + 6 * PIXELS), load(work, at + 7 * PIXELS)
-            slanted = to_first + inverse * to_second
+            to_blue, to_inverse = load(work, at + 5 * PIXELS), load(work, at + 6 * PIXELS)
             value = load(work, at + 2 * PIXELS) + to_red * red + to_green * green + to_blue * blue
-            value = value + inverse * slanted + to_second * along
+            value = value + to_inverse * (plane_x + slope_y * dy)
             left = load(work, at + PIXELS) - weight * value
             store(work, at, before - weight)
             store(work, at + PIXELS, left)
@@ -160,14 +153,13 @@ def _backward_tile(splats, entries, slots, values, inverse_depths, x0, y0, work,
             s0, sy, syy = s0 + pull, sy + pull * dy, syy + pull * (dy * dy)
             sum_red, sum_green = sum_red + weight * to_red, sum_green + weight * to_green
             sum_blue = sum_blue + weight * to_blue
-            by_inverse = weight * (slanted + inverse * to_second)
+            by_inverse = weight * to_inverse
             sum_inverse, sum_inverse_y = sum_inverse + by_inverse, sum_inverse_y + by_inverse * dy
-            sum_second = sum_second + weight * to_second
         write_moments(sums, slot, dx, s0, sy, syy)
         at = MOMENTS
         sums[slot, at], sums[slot, at + 1], sums[slot, at + 2] = total(sum_red), total(sum_green), total(sum_blue)
         sums[slot, at + 3 + AT_CENTER], sums[slot, at + 3 + SLOPE_X] = total(sum_inverse), total(sum_inverse * dx)
-        sums[slot, at + 3 + SLOPE_Y], sums[slot, at + 3 + ALONG_RAY] = total(sum_inverse_y), total(sum_second)
+        sums[slot, at + 3 + SLOPE_Y] = total(sum_inverse_y)
         if k % BATCH == BATCH - 1 and saturated(work, least):
             return k + 1
     return entries.shape[0]
@@ -178,7 +170,7 @@ def _backward_tile(splats, entries, slots, values, inverse_depths, x0, y0, work,
 def blend_backward(
     splats, start, entries, slots, values, inverse_depths, image, alpha, grad_image, grad_alpha, sums, least
 ):  # fmt: skip
-    """Fill `sums (e, 6 + 3 + 4)`: for every entry the moments, and the gradients of values and inverse depth."""
+    """Fill `sums (e, 6 + 3 + 3)`: for every entry the moments, and the gradients of values and inverse depth."""
     for tile in prange(start.shape[0] - 1):
         x0, y0, work = open_tile(tile, alpha.shape[1], 3 + CHANNELS)
         listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]

@@ -20,9 +20,9 @@ ZERO, HALF = float32(0), float32(0.5)
 # columns of a splat: centre (pixels), conic, log opacity, half width and half height (pixels)
 MX, MY, CA, CB, CC, LOG_OPACITY, REACH_X, REACH_Y = range(8)
 COLUMNS = 8
-# columns of a splat's inverse depth: value at the centre, slopes per pixel, variance along a ray
-AT_CENTER, SLOPE_X, SLOPE_Y, ALONG_RAY = range(4)
-DEPTH_COLUMNS = 4
+# columns of a splat's inverse depth: value at the centre, slopes per pixel
+AT_CENTER, SLOPE_X, SLOPE_Y = range(3)
+DEPTH_COLUMNS = 3
 
 # indices in a camera vector, after rotation (9) and translation (3) of camera_from_world and the centre (3)
 FX, FY, CX, CY, LOW_X, HIGH_X, LOW_Y, HIGH_Y, NEAR, WIDTH, HEIGHT, LOW_PASS = range(15, 27)
@@ -93,8 +93,8 @@ def _jacobian(x, y, z, camera):
 def project(means, log_scales, quaternions, opacity_logits, camera, antialiased, splats, depths, inverse_depths):
     """Fill `splats (n, 8)` and `depths (n,)`; a splat outside the image or too transparent has log opacity -inf.
 
-    Fill `inverse_depths (n, 4)` unless it is empty: mean and variance of the Gaussian's 1 / z given the pixel. The mean
-    is linear in the pixel, as 1 / z of a plane is (compare RaDe-GS, Zhang et al. 2024).
+    Fill `inverse_depths (n, 3)` unless it is empty: the mean of the Gaussian's 1 / z given the pixel. It is linear in
+    the pixel, as 1 / z of a plane is (compare RaDe-GS, Zhang et al. 2024).
     """
     n, low = means.shape[0], camera[LOW_PASS]
     for block in prange((n + BLOCK - 1) // BLOCK):
@@ -133,16 +133,14 @@ def project(means, log_scales, quaternions, opacity_logits, camera, antialiased,
             splats[g, REACH_Y] = reach_y
             depths[g] = z
             if inverse_depths.shape[0] > 0:
-                cross_x, cross_y, own = 0.0, 0.0, 0.0
+                cross_x, cross_y = 0.0, 0.0
                 for j in range(3):
                     h0, h1 = j00 * axes[0, j] + j02 * axes[2, j], j11 * axes[1, j] + j12 * axes[2, j]
                     k = -axes[2, j] / (z * z)
-                    cross_x, cross_y, own = cross_x + k * h0, cross_y + k * h1, own + k * k
-                slope_x = ((yy + low) * cross_x - xy * cross_y) / determinant
-                slope_y = ((xx + low) * cross_y - xy * cross_x) / determinant
+                    cross_x, cross_y = cross_x + k * h0, cross_y + k * h1
                 inverse_depths[g, AT_CENTER] = 1 / z
-                inverse_depths[g, SLOPE_X], inverse_depths[g, SLOPE_Y] = slope_x, slope_y
-                inverse_depths[g, ALONG_RAY] = own - slope_x * cross_x - slope_y * cross_y
+                inverse_depths[g, SLOPE_X] = ((yy + low) * cross_x - xy * cross_y) / determinant
+                inverse_depths[g, SLOPE_Y] = ((xx + low) * cross_y - xy * cross_x) / determinant
 
 
 @kernel(parallel=True)
@@ -240,7 +238,7 @@ def project_backward(
     """Add the gradients of `project` to the gradients of the raw fields, given those of the splats.
 
     `totals (n, ..)` begins with sums over pixels of dL/d(exponent) times 1, dx, dy, dx^2, dx dy, dy^2, where d goes
-    from the centre to the pixel. The gradients of the four columns of inverse depth begin at column `depth_at`, those
+    from the centre to the pixel. The gradients of the three columns of inverse depth begin at column `depth_at`, those
     of the normal at `normal_at`; 0 means that there are none.
     """
     n, low = means.shape[0], camera[LOW_PASS]
@@ -278,8 +276,8 @@ def project_backward(
                 d_yy += to_sharp * xx + to_blurred * (xx + low)
                 d_xy -= 2 * xy * (to_sharp + to_blurred)
 
-            # gradients by the covariances of 1 / z with the pixel, and twice the gradient by its variance
-            d_cross_x, d_cross_y, d_own, d_inverse_depth = 0.0, 0.0, 0.0, 0.0
+            # gradients by the covariances of 1 / z with the pixel
+            d_cross_x, d_cross_y, d_inverse_depth = 0.0, 0.0, 0.0
             if depth_at > 0 and free_x and free_y:
                 cross_x, cross_y = 0.0, 0.0
                 for j in range(3):
@@ -289,14 +287,11 @@ def project_backward(
                 slope_x, slope_y = a * cross_x + b * cross_y, b * cross_x + c * cross_y
                 d_inverse_depth = float(totals[g, depth_at + AT_CENTER])
                 d_slope_x, d_slope_y = float(totals[g, depth_at + SLOPE_X]), float(totals[g, depth_at + SLOPE_Y])
-                d_along = float(totals[g, depth_at + ALONG_RAY])
                 d_mx, d_my = d_mx - slope_x * d_inverse_depth, d_my - slope_y * d_inverse_depth
-                to_x, to_y = a * d_slope_x + b * d_slope_y, b * d_slope_x + c * d_slope_y
-                d_cross_x, d_cross_y = to_x - 2 * slope_x * d_along, to_y - 2 * slope_y * d_along
-                d_own = 2 * d_along
-                d_xx += d_along * slope_x * slope_x - to_x * slope_x
-                d_yy += d_along * slope_y * slope_y - to_y * slope_y
-                d_xy += 2 * d_along * slope_x * slope_y - to_x * slope_y - to_y * slope_x
+                d_cross_x, d_cross_y = a * d_slope_x + b * d_slope_y, b * d_slope_x + c * d_slope_y
+                d_xx -= d_cross_x * slope_x
+                d_yy -= d_cross_y * slope_y
+                d_xy -= d_cross_x * slope_y + d_cross_y * slope_x
 
             d00, d02, d11, d12, d_z = 0.0, 0.0, 0.0, 0.0, -d_inverse_depth / (z * z)
             for j in range(3):
@@ -304,7 +299,7 @@ def project_backward(
                 k = -axes[2, j] / (z * z)
                 d_h0 = 2 * d_xx * h0 + d_xy * h1 + d_cross_x * k
                 d_h1 = 2 * d_yy * h1 + d_xy * h0 + d_cross_y * k
-                d_k = d_cross_x * h0 + d_cross_y * h1 + d_own * k
+                d_k = d_cross_x * h0 + d_cross_y * h1
                 d00, d02 = d00 + d_h0 * axes[0, j], d02 + d_h0 * axes[2, j]
                 d11, d12 = d11 + d_h1 * axes[1, j], d12 + d_h1 * axes[2, j]
                 d_axes[0, j], d_axes[1, j] = j00 * d_h0, j11 * d_h1

@@ -32,8 +32,8 @@ def render(
     for camera in cameras:
         image, alpha, visible = _draw(gaussians, camera, _channels(gaussians, camera, outputs, features), options)
         if "inverse_depth" in outputs:
-            planes = _draw(gaussians, camera, moment_channels(gaussians, camera, options), options)[0]
-            image = torch.cat([image, moments(planes, camera)], -1)
+            planes = _draw(gaussians, camera, inverse_depth_planes(gaussians, camera, options), options)[0]
+            image = torch.cat([image, (planes * camera.rays()[..., [2, 0, 1]].to(planes)).sum(-1, keepdim=True)], -1)
         drawn.append((image.permute(2, 0, 1), alpha, _median_depth(gaussians, camera, outputs, options), visible))
     image, alpha, depth, visible = (torch.stack(parts) for parts in zip(*drawn, strict=True))
     return assemble_render(image, alpha, depth, visible, outputs=outputs, options=options)
@@ -50,15 +50,11 @@ def _median_depth(
     return drawn.depth[0].to(gaussians.device)
 
 
-def inverse_depth_planes(
-    gaussians: Gaussians, camera: Cameras, options: RenderOptions
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Compute the mean of each Gaussian's inverse depth as a linear function of the pixel, and its variance.
-
-    `cpu_project.project` computes the same numbers.
+def inverse_depth_planes(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> Float[Tensor, "n 3"]:
+    """Compute each Gaussian's inverse depth as a linear function of the pixel, as `cpu_project.project` does.
 
     Returns:
-        Coefficients of 1, (x - cx) / fx and (y - cy) / fy, per world unit; variances, per world unit squared.
+        Coefficients of 1, (x - cx) / fx and (y - cy) / fy, per world unit.
     """
     pose, k = camera.camera_from_world[0].to(gaussians.means), camera.intrinsics[0].to(gaussians.means)
     in_camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
@@ -77,28 +73,10 @@ def inverse_depth_planes(
     covariance = axes @ axes.mT
     blurred = covariance[:, :2, :2] + torch.diag(options.low_pass_px2 / focal.square())
     slope = torch.linalg.solve(blurred, covariance[:, :2, 2])
-    variance = covariance[:, 2, 2] - (slope * covariance[:, :2, 2]).sum(1)
     at_axis = 1 / z - (slope * center).sum(1)
     planes = torch.cat([at_axis[:, None], slope], 1)
     # the plane of a Gaussian is extrapolated if its centre is out of view: no gradient, as in the CPU's kernels
-    in_view = (held == center).all(1)
-    return torch.where(in_view[:, None], planes, planes.detach()), torch.where(in_view, variance, variance.detach())
-
-
-def moment_channels(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> Float[Tensor, "n 9"]:
-    """Compute values whose blended sums give both moments: a, b, d of c = a + b x + d y, and products for c^2 + v."""
-    planes, variance = inverse_depth_planes(gaussians, camera, options)
-    a, b, d = planes.unbind(1)
-    return torch.cat([planes, torch.stack([a * a + variance, a * b, a * d, b * b, b * d, d * d], 1)], 1)
-
-
-def moments(sums: Float[Tensor, "h w 9"], camera: Cameras) -> Float[Tensor, "h w 2"]:
-    """Compute the moments of inverse depth from the blended channels of `moment_channels`."""
-    x, y, _ = camera.rays().to(sums).unbind(-1)
-    a, b, d, aa, ab, ad, bb, bd, dd = sums.unbind(-1)
-    first = a + b * x + d * y
-    second = aa + 2 * (ab * x + ad * y + bd * x * y) + bb * x.square() + dd * y.square()
-    return torch.stack([first, second], -1)
+    return torch.where((held == center).all(1, keepdim=True), planes, planes.detach())
 
 
 class FrozenView:

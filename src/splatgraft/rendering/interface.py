@@ -15,7 +15,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 
 Output = Literal["color", "depth", "inverse_depth", "normal"]
-CHANNEL_COUNTS: dict[Output, int] = {"color": 3, "inverse_depth": 2, "normal": 3}
+CHANNEL_COUNTS: dict[Output, int] = {"color": 3, "inverse_depth": 1, "normal": 3}
 """Number of channels of each blended output, in this order; features follow. Median depth is not blended."""
 
 
@@ -58,12 +58,8 @@ class Render:
         return self._asked("depth")
 
     @property
-    def inverse_depth(self) -> Float[Tensor, "v h w 2"]:
-        """First and second moment of inverse depth along each ray, per world unit and its square.
-
-        They are sums over Gaussians of w c and of w (c^2 + v), not divided by alpha. w is the blending weight; c and v
-        are the mean and the variance of the Gaussian's inverse depth in this pixel.
-        """
+    def inverse_depth(self) -> Float[Tensor, "v h w"]:
+        """Blended inverse depth, not divided by alpha, per world unit; a Gaussian's inverse depth varies by pixel."""
         return self._asked("inverse_depth")
 
     @property
@@ -209,7 +205,7 @@ def assemble_render(
     if "depth" in outputs:
         made["depth"] = depth
     if "inverse_depth" in outputs:
-        made["inverse_depth"] = planes["inverse_depth"].permute(0, 2, 3, 1)
+        made["inverse_depth"] = planes["inverse_depth"][:, 0]
     if "normal" in outputs:
         normal = planes["normal"].permute(0, 2, 3, 1)
         squares = (normal * normal).sum(-1, keepdim=True)
