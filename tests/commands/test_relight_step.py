@@ -35,14 +35,11 @@ def relit(
     rooms: tuple[Gaussians, Gaussians],
     objects: dict[str, tuple[Gaussians, list[Similarity]]],
     *more: str,
-    exposures: dict[str, list[Exposure]] | None = None,
 ) -> Path:
     """Return the result of `relight` for a target, a source around a ball, and objects with their places by file."""
     for name, scene, thing in (("target", rooms[0], None), ("source", rooms[1], ball())):
         photograph(folder / name, scene, thing)
         write_gaussians(folder / f"{name}.ply", scene)
-    for name, photos in (exposures or {}).items():
-        exposed(folder / name, photos)
     for name, (thing, _) in objects.items():
         write_gaussians(folder / name, thing)
     placed = [ObjectPlacement(move, folder / name) for name, (_, moves) in objects.items() for move in moves]
@@ -136,29 +133,6 @@ def test_undistorted_photos_keep_the_exposure_and_no_other_metadata(tmp_path: Pa
     assert read_exposure(tmp_path / "b.jpg") == read_exposure(tmp_path / "a.jpg")
     with Image.open(tmp_path / "b.jpg") as image:
         assert set(image.getexif()) == {IFD.Exif}
-
-
-def exposure_lines(folder: Path, exposures: dict[str, list[Exposure]]) -> list[str]:
-    """Return the lines on exposure in light.txt for a ball that is moved between two rooms of one picture."""
-    found = relit(folder, (room(0.5), room(0.5)), {"own.ply": (ball(), [at(0, 0, 1.0)])}, exposures=exposures)
-    return [line for line in (found / "light.txt").read_text().splitlines() if "exposure" in line]
-
-
-def test_relight_compares_the_levels_of_both_captures(tmp_path: Path):
-    # equal pictures at an eighth of the exposure show eight times the light
-    (line,) = exposure_lines(tmp_path, {"target": [fixed(1 / 800)], "source": [fixed(1 / 100)]})
-    assert "by the exposure of the photos" in line
-    by_photos, by_light = (float(words.split()[-1]) for words in line.split(" stops brighter")[:2])
-    # the source's photos also show the darker ball: a tenth of a stop or two
-    assert by_photos == pytest.approx(3, abs=0.3)
-    # the same ratio in lux, rounded to two digits each
-    words = line.replace(",", "").split()
-    new, old = float(words[words.index("lux") - 1].lstrip("(")), float(words[words.index("at", words.index("lux")) - 1])
-    assert by_light == pytest.approx(math.log2(new / old), abs=0.2)
-
-
-def test_relight_says_nothing_of_exposure_where_one_capture_has_no_metadata(tmp_path: Path):
-    assert exposure_lines(tmp_path, {"target": [fixed(1 / 800)]}) == []
 
 
 def test_a_sun_through_a_point_and_its_shadow_is_the_light_and_the_report_says_so(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 
-from splatgraft.core.exposure import Exposure, describe_inconsistency, luminance_scale, relative_gains
+from splatgraft.core.exposure import Exposure, describe_inconsistency, relative_gains
 from splatgraft.formats.captures.exif import exif_of, read_exposure
 
 PHONE = {
@@ -91,15 +91,6 @@ def test_what_is_written_is_read_again(tmp_path, exposure):
 SUNNY = Exposure(shutter_s=1 / 100, aperture=16.0, iso=100.0)
 
 
-def test_white_paper_in_the_sun_is_not_quite_white_at_sunny_16():
-    scale = luminance_scale([SUNNY], [0.5])
-    assert scale is not None
-    # EV 14.6: 1.2 * 25600 cd/m2; 100,000 lux on a white surface of reflectance 0.9 are 28,600
-    assert scale.white == pytest.approx(30720)
-    assert 0.8 < 0.9 * 100_000 / math.pi / scale.white < 1
-    assert scale.mean == pytest.approx(0.5 * scale.white)
-
-
 def test_settings_of_equal_exposure_have_one_exposure_value_and_brightness_replaces_missing_ones():
     assert SUNNY.ev100 is not None
     # the APEX equation Av + Tv = Bv + Sv with Av = 8, Tv = log2(100), Sv = 5
@@ -113,18 +104,6 @@ def test_settings_of_equal_exposure_have_one_exposure_value_and_brightness_repla
     ):
         assert exposure.ev100 == pytest.approx(SUNNY.ev100 - stops)
     assert Exposure(shutter_s=0.01, aperture=16.0).ev100 is None
-
-
-def test_the_luminance_is_the_photos_and_needs_half_of_them():
-    darker = Exposure(shutter_s=1 / 200, aperture=16.0, iso=100.0)
-    # one scene photographed with half the exposure has half the pixel values
-    one, both = luminance_scale([SUNNY], [0.5]), luminance_scale([SUNNY, darker], [0.5, 0.25])
-    assert one is not None
-    assert both is not None
-    assert both.mean == pytest.approx(one.mean)
-    assert luminance_scale([SUNNY, Exposure()], [0.5, 0.5]) == one
-    assert luminance_scale([SUNNY, Exposure(), Exposure()], [0.5, 0.5, 0.5]) is None
-    assert luminance_scale([], []) is None
 
 
 def test_what_differs_is_named_with_both_ends_and_little_or_no_data_is_not_worth_a_line():

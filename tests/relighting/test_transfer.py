@@ -11,7 +11,6 @@ from shapes import ring, surfels
 from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.directions import even_directions, frames_along
-from splatgraft.core.exposure import LuminanceScale
 from splatgraft.core.gaussians import Gaussians, concatenate, empty
 from splatgraft.core.images import LUMINANCE, linear_from_srgb
 from splatgraft.core.similarity import Similarity
@@ -32,7 +31,6 @@ from splatgraft.relighting.cast_shadows import SHADOW_POWER, cast_shadows
 from splatgraft.relighting.layers import assemble_layers
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.relighting.prepared_object import prepare_object
-from splatgraft.relighting.report import describe_level
 from splatgraft.relighting.scene_light import SceneLight, find_scene_light
 from splatgraft.relighting.shading import ShadeSettings, shade_ratio
 
@@ -426,40 +424,3 @@ def test_between_two_given_lights_the_level_changes_in_full(factor):
     shade = relit.shade[relit.is_object]
     # both irradiances come from the same samples; float32
     assert torch.allclose(shade, torch.full_like(shade, factor), rtol=1e-3)
-
-
-@pytest.fixture(scope="module")
-def dimmed() -> Relit:
-    """Return the transfer of a ball from even light of radiance 0.4 into 0.2, both in units of their captures."""
-    even = [Light(sources=(), ambient=fit_ambient(torch.full((3,), radiance))) for radiance in (0.4, 0.2)]
-    composite = placed((ball(count=500), at(0.0, 0.0, 0.0)), target=shell(count=500))
-    source = SourceScene(empty(), cameras(), light=even[0])
-    return relight(composite, cameras(), sources=(source,), light=even[1], options=WHOLE)
-
-
-def test_agreeing_levels_are_said_in_stops_and_lux(dimmed: Relit):
-    # the target's white is 8 times the source's, and half as much of it arrives: 2 stops by the light and the photos
-    (note,) = describe_level(dimmed, target=LuminanceScale(800.0, 200.0), source=LuminanceScale(100.0, 50.0))
-    assert "the new place is 2.0 stops brighter than the old one" in note.text
-    assert "light on the object 2.0 stops brighter" in note.text
-    assert "differ" not in note.text
-    assert not note.in_doubt
-    # even radiance L gives pi L of illuminance on a convex body; the ball's own Gaussians take some of it
-    words = note.text.replace(",", "").split()
-    there, old = (float(words[i - 1].lstrip("(")) for i, word in enumerate(words) if word in ("lux", "at"))
-    assert there == pytest.approx(math.pi * 0.2 * 800, rel=0.15)
-    assert there == pytest.approx(4 * old, rel=0.05)
-
-
-def test_levels_that_do_not_agree_are_doubted_and_nothing_is_compared_without_light(dimmed: Relit):
-    (note,) = describe_level(dimmed, target=LuminanceScale(800.0, 10.0), source=LuminanceScale(100.0, 40.0))
-    assert "the new place is 2.0 stops darker than the old one" in note.text
-    assert "They differ by 4.0 stops" in note.text
-    assert note.in_doubt
-    assert "sun" not in note.text
-    (note,) = describe_level(dimmed, target=LuminanceScale(8e5, 2e5), source=LuminanceScale(1e5, 5e4))
-    assert "more than sun and sky give" in note.text
-    scale = LuminanceScale(100.0, 20.0)
-    unknown = replace(dimmed, prepared=(replace(dimmed.prepared[0], source_lighting=None),))
-    assert describe_level(unknown, target=scale, source=scale) == ()
-    assert describe_level(dimmed, target=scale, source=LuminanceScale(100.0, 0.0)) == ()

@@ -1,15 +1,12 @@
-"""Camera settings of photographs, and the absolute luminance of linear pixel values that follows from them.
+"""Camera settings of photographs: exposure values, and differences between photographs.
 
-Exposure values are at ISO 100: EV = log2(N^2 / t) - log2(ISO / 100). A pixel saturates at 1.2 * 2^EV cd/m2, for a
-saturation-based speed of 78 / H (ISO 12232) and a lens that transmits 0.65 of the light.
+Exposure values are at ISO 100: EV = log2(N^2 / t) - log2(ISO / 100).
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median
 
-_SATURATION_CD_M2 = 78 / (100 * 0.65)  # luminance of white at EV 0 and ISO 100
 MAX_STOPS = 0.4
 """Largest range of exposures, stops, in a capture whose settings count as equal: one step of a camera's dial. This is a
 third of a stop, up to 0.36 by the rounded numbers on the dial (1/160 s and 1/125 s)."""
@@ -62,28 +59,6 @@ def relative_gains(exposures: Sequence[Exposure]) -> list[float]:
     middle = sum(stops) / max(len(stops), 1)
     gains = [1.0 if one.ev100 is None else 2 ** ((middle - one.ev100) / 2.2) for one in exposures]
     return [gain * len(gains) / sum(gains) for gain in gains]
-
-
-@dataclass(frozen=True)
-class LuminanceScale:
-    """Luminance of a capture's linear values, cd/m2; accurate to about a stop, because cameras' speeds differ."""
-
-    white: float
-    """Luminance of the linear value 1 in the median photo."""
-    mean: float
-    """Mean luminance of a photo's content, median over photos."""
-
-
-def luminance_scale(exposures: Sequence[Exposure], means: Sequence[float]) -> LuminanceScale | None:
-    """Compute the luminance scale of a capture; None if fewer than half of the photos have exposure data.
-
-    `means` are mean linear luminances of the photos' pixels, in [0, 1].
-    """
-    whites = [None if one.ev100 is None else _SATURATION_CD_M2 * 2**one.ev100 for one in exposures]
-    known = [(white, mean) for white, mean in zip(whites, means, strict=True) if white is not None]
-    if not known or 2 * len(known) < len(exposures):
-        return None
-    return LuminanceScale(median(white for white, _ in known), median(white * mean for white, mean in known))
 
 
 def describe_inconsistency(exposures: Sequence[Exposure]) -> str | None:

@@ -33,7 +33,6 @@ _PIXELS_PER_BYTE = 1 << 14
 """Bound above every real image: a black 1-bit PNG has 8256. Pillow itself refuses more than 179 million pixels."""
 LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 """Luminance weights of linear RGB (Rec. 709)."""
-_MEAN_PX = 256  # minimum size at which a JPEG is decoded for its mean
 _GREY_SCALES = {"I;16": 65535, "I;16B": 65535, "I;16L": 65535, "I;16N": 65535, "I": 65535, "F": 1}
 """White level of Pillow's modes of more than 8 bits; some versions read a 16-bit PNG as mode I."""
 
@@ -149,15 +148,6 @@ def shrink_on_decoding(image: Image.Image, longest_px: int) -> None:
     factor = 2 * longest_px / max(image.size)
     if factor < 1:
         image.draft(None, (math.ceil(image.width * factor), math.ceil(image.height * factor)))
-
-
-def mean_luminance(path: Path) -> float:
-    """Compute the mean linear luminance (Rec. 709) of a picture, in [0, 1]; a JPEG is decoded at a small size."""
-    with opened(path) as image:
-        image.draft(None, (_MEAN_PX, _MEAN_PX))
-        image.load()
-        linear = linear_from_srgb(_rgb(image)).mean((0, 1))
-    return float(linear @ LUMINANCE)
 
 
 def read_grey(path: Path, longest_px: int) -> UInt8[np.ndarray, "h w"]:

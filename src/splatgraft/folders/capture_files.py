@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatgraft.core.exposure import LuminanceScale, describe_inconsistency, luminance_scale, relative_gains
-from splatgraft.core.images import list_images, mean_luminance
+from splatgraft.core.exposure import describe_inconsistency, relative_gains
+from splatgraft.core.images import list_images
 from splatgraft.core.posed_images import LeftOut, PosedImages
-from splatgraft.formats import list_capture_images
 from splatgraft.formats.captures import find_poses
 from splatgraft.formats.captures.exif import read_exposure
 from splatgraft.runtime.note import Note
@@ -90,12 +89,3 @@ def read_view_gains(photos: Sequence[Path]) -> list[float] | None:
     """Read the brightness of each photo over their mean, by its settings; None if the settings are constant."""
     exposures = [read_exposure(photo) for photo in photos]
     return None if describe_inconsistency(exposures) is None else relative_gains(exposures)
-
-
-def read_luminance_scale(cameras: Path) -> LuminanceScale | None:
-    """Read the luminance scale of a capture; None if its images do not exist or have no exposure data."""
-    photos = list_capture_images(cameras)
-    exposures = [read_exposure(photo) for photo in photos]
-    if all(one.ev100 is None for one in exposures):
-        return None  # before any pixels are read
-    return luminance_scale(exposures, [mean_luminance(photo) for photo in photos])

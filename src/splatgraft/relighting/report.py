@@ -1,8 +1,4 @@
-"""Pictures of the estimated lights, and a check of their level against the exposure of the photos.
-
-Exposure metadata gives both captures absolute units, so the estimated change of illuminance can be compared with the
-change of the photos' luminance. The check changes no result: the ratio applied to the object is in relative units.
-"""
+"""Pictures of the estimated lights."""
 
 import math
 
@@ -13,84 +9,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.directions import tangents
-from splatgraft.core.exposure import LuminanceScale
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import LUMINANCE, srgb_from_linear
-from splatgraft.relighting.layers import Relit
+from splatgraft.core.images import srgb_from_linear
 from splatgraft.relighting.light.estimate import EstimatedLight
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import cube_pixels, nearest_directions, render_panorama
-from splatgraft.runtime.note import Note
 
-# doubtful levels; set by hand
-_MAX_DIFFERENCE = 1.5  # stops; mean reflectances of captures, mostly .1 to .5, seldom differ by more
-_MAX_LUX = 200_000.0  # sun and clear sky give up to 130,000; the rest allows for errors of the cameras' speeds
-
-# pictures
 _HEIGHT = 256  # pixels of the panorama, which is twice as wide
 _FACE = 128  # pixels; face width of the cube map
 _UNSEEN = torch.tensor([0.35, 0.35, 0.38])  # sRGB of directions that were not photographed
 _STOPS = 2.0  # residual of full colour: red if a surface is brighter than explained, blue if it is darker
 _RED, _WHITE, _BLUE = torch.tensor([[0.8, 0.1, 0.1], [0.92, 0.92, 0.92], [0.1, 0.25, 0.8]])
-
-
-def describe_level(relit: Relit, *, target: LuminanceScale, source: LuminanceScale) -> tuple[Note, ...]:
-    """Compare the change of light from the old to the new place by the photos with that by the estimated lights.
-
-    Args:
-        relit: A transfer.
-        target: Luminance scale of the target's photos.
-        source: Luminance scale of the source's photos, from which all objects with a known light come.
-
-    Returns:
-        One note for each object with a known source light. It is a warning if the two disagree or if there is more
-        light than under the sun. No notes if the photos of one capture are black.
-    """
-    if min(target.mean, source.mean) <= 0:
-        return ()
-    notes = []
-    for prepared, received in zip(relit.prepared, relit.received, strict=True):
-        if prepared.source_lighting is None:
-            continue
-        weights = prepared.gaussians.opacities
-        new = target.white * _mean_luminance(received, weights)
-        old = source.white * _mean_luminance(prepared.source_lighting.irradiance, weights)
-        if min(new, old) > 0:
-            notes.append(_level_note(prepared.number, math.log2(target.mean / source.mean), new=new, old=old))
-    return tuple(notes)
-
-
-def _level_note(number: int, by_photos: float, *, new: float, old: float) -> Note:
-    by_light = math.log2(new / old)
-    plain = (
-        f"Object {number}: by the exposure of the photos the new place is {_brighter(by_photos)} than the old one, by "
-        f"the light on the object {_brighter(by_light)} ({_rounded(new)} lux there, {_rounded(old)} at the old place)."
-    )
-    doubts = ""
-    if abs(by_light - by_photos) > _MAX_DIFFERENCE:
-        doubts += (
-            f" They differ by {abs(by_light - by_photos):.1f} stops: one of the lights may be wrong, or the surfaces "
-            f"in the photos of the two places differ as much in reflectance."
-        )
-    if max(new, old) > _MAX_LUX:
-        doubts += " That is more than sun and sky give: the estimated light is too strong, or the metadata is wrong."
-    if not doubts:
-        return Note(plain)
-    return Note(plain + doubts, "warning", "If the object looks too bright or too dark, correct it (--exposure).")
-
-
-def _mean_luminance(irradiance: Float[Tensor, "n 3"], weights: Float[Tensor, "n"]) -> float:
-    mean = (weights[:, None] * irradiance).sum(0) / weights.sum().clamp_min(1e-9)
-    return float(mean @ LUMINANCE)
-
-
-def _brighter(stops: float) -> str:
-    return f"{abs(stops):.1f} stops {'brighter' if stops >= 0 else 'darker'}"
-
-
-def _rounded(lux: float) -> str:
-    """Round to two digits, the precision of a camera's calibration."""
-    return f"{float(f'{lux:.2g}'):,.6g}"
 
 
 def draw_light(found: EstimatedLight, scene: Gaussians, center: Float[Tensor, "3"]) -> Float[Tensor, "h w 3"]:

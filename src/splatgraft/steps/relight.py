@@ -10,7 +10,7 @@ import torch
 from splatgraft.compositing.composite import Composite
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.images import write_image
-from splatgraft.folders.capture_files import camera_files, read_luminance_scale
+from splatgraft.folders.capture_files import camera_files
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.project.gaussian_flags import write_flags
@@ -20,7 +20,7 @@ from splatgraft.project.step import Context, Inputs
 from splatgraft.relighting.layers import LayerWeights, Relit
 from splatgraft.relighting.light.light import Light, light_from_json, light_to_json
 from splatgraft.relighting.prepared_object import SourceScene
-from splatgraft.relighting.report import describe_level, draw_light
+from splatgraft.relighting.report import draw_light
 from splatgraft.relighting.transfer import RelightOptions, relight
 from splatgraft.runtime.note import Note
 
@@ -75,7 +75,7 @@ class Relight:
             relit = relight(composite, cameras, sources=sources, light=self.given(), options=self.options)
             found = relit.light
             gaussians, is_object = relit.bake(self.weights)
-            notes = (*relit.report, *self._level(relit))
+            notes = relit.report
             _draw_lights(folder, relit, composite, sources)
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_flags(folder / IS_OBJECT_FILE, is_object)
@@ -84,17 +84,6 @@ class Relight:
             (folder / LIGHT_FILE).write_text(light_to_json(found))
         picture = folder / LIGHT_PICTURE
         context.console.tell(*(replace(note, picture=picture if picture.is_file() else None) for note in notes))
-
-    def _level(self, relit: Relit) -> tuple[Note, ...]:
-        """Compare the light's level with the exposure metadata of both captures. Their photos are no inputs of the
-        step, because only this note depends on them."""
-        if self.object_cameras is None:
-            return ()
-        try:
-            target, source = read_luminance_scale(self.cameras), read_luminance_scale(self.object_cameras)
-        except ValueError as error:  # the transfer itself needs no photo
-            return (Note(f"The photos' exposure was not compared with the light: {error}.", "warning"),)
-        return () if target is None or source is None else describe_level(relit, target=target, source=source)
 
     def given(self) -> Light | None:
         """Read the light that replaces the estimate; None if none is given."""
