@@ -2,6 +2,7 @@
 
 import json
 import math
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -13,12 +14,14 @@ from tiny_project import ball, photograph, plane
 
 from splatgraft.capture.photos import working_copies, write_undistorted
 from splatgraft.cli import main
+from splatgraft.core.clock_sun import ClockSun, SunCandidate
 from splatgraft.core.directions import even_directions
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.exposure import Exposure
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
+from splatgraft.folders.clock_sun import write_clock_sun
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.formats.captures.exif import exif_of, read_exposure
 from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
@@ -35,11 +38,14 @@ def relit(
     rooms: tuple[Gaussians, Gaussians],
     objects: dict[str, tuple[Gaussians, list[Similarity]]],
     *more: str,
+    sun: ClockSun | None = None,
 ) -> Path:
     """Return the result of `relight` for a target, a source around a ball, and objects with their places by file."""
     for name, scene, thing in (("target", rooms[0], None), ("source", rooms[1], ball())):
         photograph(folder / name, scene, thing)
         write_gaussians(folder / f"{name}.ply", scene)
+    if sun is not None:
+        write_clock_sun(folder / "target", sun)
     for name, (thing, _) in objects.items():
         write_gaussians(folder / name, thing)
     placed = [ObjectPlacement(move, folder / name) for name, (_, moves) in objects.items() for move in moves]
@@ -72,10 +78,14 @@ def test_copies_lose_the_same_old_light_and_a_strange_object_keeps_its_own(tmp_p
     assert abs(kept) < 0.2 * lost
 
 
-def test_the_lights_of_both_places_are_drawn_past_an_object_without_gaussians(tmp_path: Path):
+def test_the_lights_of_both_places_are_drawn_past_an_object_without_gaussians(tmp_path: Path, capsys):
     nothing = ball().select(torch.zeros(0, dtype=torch.int64))
     objects = {"nothing.ply": (nothing, [at(0, 0)]), "own.ply": (ball(), [at(0, 0)])}
-    found = relit(tmp_path, (room(0.8), room(0.25)), objects)
+    sun = ClockSun((SunCandidate(datetime(2019, 6, 12, 16, 46, tzinfo=UTC), "GPS", 44.0),), (0.0, 0.0, 1.0), 5.0, "up")
+    found = relit(tmp_path, (room(0.8), room(0.25)), objects, sun=sun)
+    # the time is printed, but it is not in the report, which can be shared
+    assert "12 June 2019, 16:46 UTC by GPS: sun 44.0 degrees high" in " ".join(capsys.readouterr().err.split())
+    assert "2019" not in (found / "light.txt").read_text()
     drawn = {path.name: read_rgb(path) for path in found.glob("*.png")}
     # numbered as the placement's objects, as in the report
     assert "At the old place of object 2" in (found / "light.txt").read_text()

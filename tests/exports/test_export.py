@@ -5,6 +5,7 @@ import re
 import zipfile
 from collections import Counter
 from dataclasses import replace
+from datetime import datetime, timedelta, timezone
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from PIL import Image
 from small_transfer import parts, write_transfer
 
 from splatgraft.cli import main
+from splatgraft.core.clock_sun import ClockSun, SunCandidate
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.similarity import Similarity
 from splatgraft.evaluation import Report, ReportView, write_report
@@ -22,6 +24,7 @@ from splatgraft.exports.export import ExportOptions, export_scene, layer_of
 from splatgraft.exports.export_source import ExportSource, first_view, path_around, upright
 from splatgraft.exports.pictures import write_video
 from splatgraft.exports.shadow_layer import shadow_layer
+from splatgraft.folders.clock_sun import write_clock_sun
 from splatgraft.folders.export_source import read_export_source
 from splatgraft.formats import SceneMetadata, read_gaussians, read_scene, write_gaussians
 from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
@@ -362,3 +365,18 @@ def test_the_report_is_one_file_with_its_pictures(project, tmp_path, capsys):
     assert "index.html: expected the report of a project, found none" in capsys.readouterr().err
     assert main(["export", str(project), "--to", str(tmp_path / "a.sog"), "--page", "report"]) == 2
     assert "--page report: expected a file that ends in .html, found a.sog" in capsys.readouterr().err
+
+
+def test_nothing_that_is_exported_tells_when_the_photos_were_taken(tmp_path):
+    project = write_transfer(tmp_path)
+    time = datetime(2019, 6, 12, 16, 46, tzinfo=timezone(timedelta(hours=-4)))
+    sun = ClockSun((SunCandidate(time, "GPS", 44.0, (0.6, 0.0, 0.8)),), (0.0, 0.0, 1.0), 5.0, "a track")
+    write_clock_sun(project / "target" / "capture", sun)
+    (project / "report").mkdir()
+    picture = torch.rand(60, 80, 3, generator=torch.Generator().manual_seed(0))
+    write_report(project / "report", Report("A report", "It is one."), views=[ReportView("v", False, {"a": picture})])
+    for name, page in (("a.html", "viewer"), ("b.html", "report"), ("c.glb", ""), ("d.ply", ""), ("e.png", "")):
+        to = tmp_path / name
+        assert main(["export", str(project), "--to", str(to), *(["--page", page] if page else [])]) == 0
+        content = to.read_bytes()
+        assert not [word for word in (b"2019-06-12", b"12 June 2019", b"16:46", b"clock_sun") if word in content]

@@ -1,5 +1,6 @@
 """Capture: posed images from photos, a video, or a trained scene without images."""
 
+from splatgraft.capture.clock_sun import geotag_notes, sun_by_clock, sun_heights
 from splatgraft.capture.metric_scale import scale_from_length, scale_from_marker, triangulate
 from splatgraft.capture.photos import write_reduced
 from splatgraft.capture.pose_report import PoseReport, read_doubts, write_pose_report
@@ -23,6 +24,7 @@ __all__ = [
     "VirtualCameraOptions",
     "describe_video",
     "extract_frames",
+    "geotag_notes",
     "place_virtual_cameras",
     "pose_photos",
     "predict_pose_seconds",
@@ -31,6 +33,8 @@ __all__ = [
     "require_coverage",
     "scale_from_length",
     "scale_from_marker",
+    "sun_by_clock",
+    "sun_heights",
     "triangulate",
     "usable_masks",
     "usable_photos",

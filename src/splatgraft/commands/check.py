@@ -6,7 +6,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from splatgraft.capture import predict_pose_seconds
+import torch
+
+from splatgraft.capture import geotag_notes, predict_pose_seconds, sun_by_clock, sun_heights
 from splatgraft.capture.photo_inspection import (
     SIDE_PX,
     Finding,
@@ -22,9 +24,10 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import focus_point
 from splatgraft.core.images import read_exif, read_grey, stored_size
 from splatgraft.folders.capture_files import has_poses
+from splatgraft.folders.clock_sun import read_clock_sun
 from splatgraft.folders.input_description import require_input
 from splatgraft.formats import is_scene, read_capture, read_gaussians
-from splatgraft.formats.captures.exif import read_exposure
+from splatgraft.formats.captures.exif import read_exposure, read_geotag
 from splatgraft.formats.captures.masks import PhotoFiles, find_photos
 from splatgraft.formats.captures.photo_archive import is_archive, unpack_photos
 from splatgraft.project.step import Positional
@@ -90,6 +93,8 @@ class Check:
             yield from find_in_photos(greys, names, has_poses=posed is not None, progress=progress)
         yield find_in_exposures([read_exposure(path) for path in used])
         yield _lens(used)
+        kept = [path not in left_out for path in photos.paths]
+        yield from _sun(self.capture, used, None if posed is None else posed.cameras[torch.tensor(kept)])
         if posed is not None:
             yield Finding("poses", "good", f"given for {len(posed)} images, with {len(posed.points)} points")
             yield _coverage(posed.cameras)
@@ -121,6 +126,19 @@ def _lens(photos: Sequence[Path]) -> Finding:
     known = sum(_FOCAL_LENGTH in read_exif(photo) for photo in photos)
     estimated = "all photos" if known == len(photos) else f"{known} of {len(photos)} photos; estimated for the others"
     return Finding("lens", "good", f"focal length in EXIF of {estimated}")
+
+
+def _sun(capture: Path, photos: Sequence[Path], cameras: Cameras | None) -> Iterator[Finding]:
+    """Find the sun by time and place of the photos, its direction only if they have poses."""
+    tags = [read_geotag(photo) for photo in photos]
+    if cameras is None:
+        said = "; or ".join(one.describe() for one in sun_heights(tags))
+    else:
+        sun = read_clock_sun(capture) or sun_by_clock(tags, cameras)
+        said = "" if sun is None else sun.describe(cameras)
+    notes = [note.text for note in geotag_notes(tags, [photo.name for photo in photos])]
+    for text in [said, *notes] if said else notes:
+        yield Finding("sun", "good", text)
 
 
 def _coverage(cameras: Cameras) -> Finding:

@@ -14,6 +14,7 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_radiance
 from splatgraft.core.rotations import rotation_between
+from splatgraft.folders.clock_sun import read_clock_sun
 from splatgraft.folders.composite_folder import read_composite
 from splatgraft.formats import is_scene, read_cameras, read_gaussians
 from splatgraft.project.layout import CAMERAS_FILE, PROJECT_FILE, SCENE_FILE
@@ -93,6 +94,9 @@ class LightAt:
         console.say(
             f"The light at {', '.join(f'{v:.3g}' for v in place.center.tolist())}: {describe_light(light, up)}."
         )
+        sun = read_clock_sun(step.cameras)
+        if sun is not None:
+            console.say(f"By the clock of the target's photos: {sun.describe(cameras)}.")
         console.result(self.out)
         console.result(lamps)
         return 0

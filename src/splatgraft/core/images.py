@@ -174,11 +174,11 @@ def read_upright(path: Path, longest_px: int) -> tuple[UInt8[np.ndarray, "h w 3"
     return np.array(small), size
 
 
-def read_exif(path: Path) -> dict[int, Any]:
-    """Read the camera's EXIF tags, with Pillow's values; empty if there are none or they are damaged."""
+def read_exif(path: Path, *, part: IFD = IFD.Exif) -> dict[int, Any]:
+    """Read the EXIF tags of the camera or of another part, with Pillow's values; empty if none or damaged."""
     with opened(path) as image:
         try:
-            return dict(image.getexif().get_ifd(IFD.Exif))
+            return dict(image.getexif().get_ifd(part))
         except Exception:  # Pillow's parsers raise more kinds than it documents; damaged metadata counts as none
             return {}
 

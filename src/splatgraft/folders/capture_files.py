@@ -8,8 +8,10 @@ from splatgraft.core.images import list_images
 from splatgraft.core.posed_images import LeftOut, PosedImages
 from splatgraft.formats.captures import find_poses
 from splatgraft.formats.captures.exif import read_exposure
+from splatgraft.project.layout import CLOCK_SUN_FILE
 from splatgraft.runtime.note import Note
 
+_NOT_POSES = ("step.json", CLOCK_SUN_FILE)
 _NAMED = 8  # maximum number of images that a message names
 
 
@@ -19,13 +21,13 @@ def has_poses(path: Path) -> bool:
 
 
 def description_files(path: Path) -> tuple[Path, ...]:
-    """List the files with poses and points: all in the folder except images, step.json and hidden files."""
+    """List the files with poses and points: all in the folder except images, the sun's, step.json and hidden files."""
     if path.is_file():
         return (path,)
     if not path.is_dir():
         raise ValueError(f"{path}: expected a capture folder, found nothing")
     suffixes = {".json", ".ply", ".bin", ".txt"}
-    found = [p for p in path.rglob("*") if p.is_file() and p.suffix in suffixes and p.name != "step.json"]
+    found = [p for p in path.rglob("*") if p.is_file() and p.suffix in suffixes and p.name not in _NOT_POSES]
     return tuple(sorted(p for p in found if not any(part.startswith(".") for part in p.relative_to(path).parts)))
 
 

@@ -1,5 +1,6 @@
 """The command `capture`: make a folder with transforms.json of photos, a video, poses or a trained scene."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
@@ -8,16 +9,19 @@ from splatgraft.capture import (
     PoseOptions,
     VirtualCameraOptions,
     extract_frames,
+    geotag_notes,
     place_virtual_cameras,
     pose_photos,
     read_doubts,
     require_coverage,
+    sun_by_clock,
     usable_masks,
     usable_photos,
     usable_views,
     write_pose_report,
     write_reduced,
 )
+from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.folders.capture_files import (
@@ -28,8 +32,10 @@ from splatgraft.folders.capture_files import (
     left_out_notes,
     unposed_notes,
 )
+from splatgraft.folders.clock_sun import clock_sun_path, read_clock_sun, write_clock_sun
 from splatgraft.formats import is_scene, read_capture, read_scene, scene_files, write_capture
 from splatgraft.formats.captures import read_given_poses
+from splatgraft.formats.captures.exif import read_geotag
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.formats.captures.photo_archive import is_archive, unpack_photos
 from splatgraft.project.step import Context, Inputs, Positional
@@ -50,7 +56,7 @@ class Capture:
     """A folder or a .zip of photos, a video, a COLMAP folder, a folder with transforms.json, or a trained scene (.ply,
     .spz, .splat, .sog, .glb, .ksplat)."""
     out: Path = Path("capture")
-    """Folder for transforms.json and points.ply."""
+    """Folder for transforms.json, points.ply and clock_sun.json."""
     poses: Path | None = None
     """Poses that another program found for photos: a COLMAP folder or a transforms.json."""
     max_side: int = 1600
@@ -60,6 +66,9 @@ class Capture:
     """Whether blurred photos and copies of other photos are used; otherwise they are named and left out."""
     accept_doubtful: bool = False
     """Whether `run` continues with poses that are not plausible; otherwise it stops after this step."""
+    clock_sun: bool = True
+    """Whether the sun's direction by the photos' time, place and compass is kept in clock_sun.json, which is never
+    exported."""
     axes: str | None = None
     """Directions of x, y and z of a trained scene (RDF: right, down, front), if those of its format are wrong."""
     options: PoseOptions = field(default_factory=PoseOptions)
@@ -70,7 +79,9 @@ class Capture:
         if is_scene(self.capture):
             return {"photos": scene_files(self.capture)}
         if self.poses is None and has_poses(self.capture):
-            return capture_inputs(self.capture, read_capture(self.capture), masks=True)
+            sun = clock_sun_path(self.capture)
+            files = capture_inputs(self.capture, read_capture(self.capture), masks=True)
+            return files | {"sun": (sun,)} if sun.is_file() else files
         files = {"photos": (self.capture,)}
         if self.capture.is_dir():
             photos = find_photos(self.capture)
@@ -83,10 +94,13 @@ class Capture:
         """Write the posed capture."""
         if self.poses is not None:
             posed = self._with_given_poses(self.poses, folder, context)
+            originals = posed.image_paths
         elif is_scene(self.capture):
             posed = self._pictures(folder, context)
+            originals = ()
         elif has_poses(self.capture):
             posed = self._taken_over(context)
+            originals = posed.image_paths
             context.console.tell(*exposure_notes(self.capture, posed.image_paths))
             if self.max_side > 0:
                 posed = write_reduced(posed, folder, self.max_side, progress=context.progress)
@@ -104,8 +118,24 @@ class Capture:
             context.console.say(f"{self.capture}: {report}")
             context.console.tell(*(Note(f"{self.capture}: doubtful: {d}", "warning") for d in report.doubts))
             write_pose_report(folder, report)
+            by_stem = {photo.stem: photo for photo in photos.paths}
+            originals = tuple(by_stem[Path(name).stem] for name in posed.cameras.names)
         require_coverage(posed, str(self.capture))
         write_capture(folder, posed.limited(self.max_side) if self.max_side > 0 else posed)
+        if self.clock_sun and originals:
+            self._write_clock_sun(folder, originals, posed.cameras, context)
+
+    def _write_clock_sun(self, folder: Path, photos: Sequence[Path], cameras: Cameras, context: Context) -> None:
+        """Write the sun's direction by the photos' clock; a capture that is taken over may have it already."""
+        sun = read_clock_sun(self.capture)
+        if sun is None:
+            tags = [read_geotag(photo) for photo in photos]
+            notes = geotag_notes(tags, cameras.names)
+            context.console.tell(*(replace(note, text=f"{self.capture}: {note.text}") for note in notes))
+            sun = sun_by_clock(tags, cameras)
+        if sun is not None:
+            write_clock_sun(folder, sun)
+            context.console.say(f"{self.capture}: {sun.describe(cameras)}")
 
     def _taken_over(self, context: Context) -> PosedImages:
         """Read the posed capture without its unusable images, which are printed."""

@@ -11,6 +11,7 @@ from splatgraft.compositing.composite import Composite
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.images import write_image
 from splatgraft.folders.capture_files import camera_files
+from splatgraft.folders.clock_sun import read_clock_sun
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.project.gaussian_flags import write_flags
@@ -77,6 +78,9 @@ class Relight:
             gaussians, is_object = relit.bake(self.weights)
             notes = relit.report
             _draw_lights(folder, relit, composite, sources)
+            sun = read_clock_sun(self.cameras)
+            if sun is not None:  # not among the notes: light.txt is part of the report, which can be shared
+                context.console.say(f"By the clock of the target's photos: {sun.describe(cameras)}.")
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_flags(folder / IS_OBJECT_FILE, is_object)
         (folder / LIGHT_TEXT_FILE).write_text("".join(f"{note.text}\n" for note in notes))
