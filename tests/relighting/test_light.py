@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from splatgraft.core import spherical_harmonics
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.capture_orientation import estimate_up, focus_point
+from splatgraft.core.clock_sun import ClockSun, SunCandidate
 from splatgraft.core.directions import even_directions, fit_sh
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
@@ -34,7 +36,7 @@ from splatgraft.relighting.light.panorama import (
     render_panorama,
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
-from splatgraft.relighting.light.sun import SET_BY_HAND, find_sun, set_sun, with_sun
+from splatgraft.relighting.light.sun import BY_CLOCK, SET_BY_HAND, find_sun, set_sun, sun_by_clock, with_sun
 
 
 def shell(colors, directions, *, radius=2.0, spread=0.12):
@@ -351,6 +353,57 @@ def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s
     # far from all surfaces there is no edge: the points give only the direction
     away = [(20.0 + x, y, z) for x, y, z in points]
     assert set_sun(away, CapturedScene(scene, views())).ratio is None
+
+
+def clock_at(*directions, error_deg=5.0):
+    """Return the sun by a clock with these candidates."""
+    noon = datetime(2026, 6, 1, 12, tzinfo=UTC)
+    candidates = [SunCandidate(noon, "GPS", 30.0, tuple(one.tolist())) for one in directions]
+    return ClockSun(tuple(candidates), (0.0, 0.0, 1.0), error_deg, "a compass", None)
+
+
+def test_a_clock_decides_between_shadows_and_does_not_overrule_clear_ones():
+    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+    scene, region = sunlit_scene(sun, 3.0), BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 2.4)
+    near, far = (
+        torch.nn.functional.normalize(torch.tensor(one), dim=0) for one in ([0.5, -0.7, 0.5], [-0.6, 0.5, 0.5])
+    )
+    for clock in (clock_at(near), clock_at(far, near), clock_at(far)):
+        found = find_sun(CapturedScene(scene, views(), clock), region)
+        assert found is not None
+        # the shadows are clear
+        assert degrees_apart(found.direction, sun) < 3
+    faint = painted(scene, lambda at: 0.3 + 0.7 * ((at[:, :2] * 40).sin().prod(1) > 0))
+    bare = find_sun(CapturedScene(faint, views()), region, decisive=0.0)
+    assert bare is not None
+    # among candidates of equal shadows the clock's own is the likelier
+    by_clock = find_sun(CapturedScene(faint, views(), clock_at(near)), region, decisive=0.0)
+    assert by_clock is not None
+    assert by_clock.evidence > bare.evidence
+
+
+def test_the_clock_moves_the_source_that_may_be_the_sun_and_no_other():
+    towards = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+    source = LightSource((0.8, 0.0, 0.6), (3.0, 3.0, 2.0), uncertainty_deg=10.0, name="sun or window")
+    light = Light((source,), fit_ambient(torch.full((3,), 0.3)))
+    scene = sunlit_scene(towards, 3.0)
+
+    def moved(*directions):
+        return sun_by_clock(light, CapturedScene(scene, views(), clock_at(*directions) if directions else None))
+
+    near = torch.nn.functional.normalize(torch.tensor([0.8, 0.4, 0.6]), dim=0)
+    found = moved(near, -near)
+    assert found is not None
+    assert found.name == BY_CLOCK
+    assert torch.allclose(found.direction, near)
+    assert found.error_deg == 5.0
+    # the irradiance on the floor stays, and the source keeps its share of it
+    after = with_sun(light, found)
+    assert len(after.sources) == 1
+    assert after.irradiance(UP[None])[0].tolist() == pytest.approx(light.irradiance(UP[None])[0].tolist(), rel=1e-4)
+    # a lamp from the other side is not the sun, and without a clock nothing moves
+    assert moved(torch.tensor([-0.8, 0.0, 0.6])) is None
+    assert moved() is None
 
 
 def test_shadows_show_the_sun_on_a_floor_of_two_materials():

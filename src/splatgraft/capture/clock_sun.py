@@ -234,7 +234,7 @@ def _fit(
     Returns:
         The attitude matrix of the rotation; the inverse covariance of small rotations; metres per world unit.
     """
-    weight = np.full(len(metres), 1 / len(metres))
+    weight, attitude, scale = np.full(len(metres), 1 / len(metres)), np.zeros((3, 3)), 0.0
     for _ in range(_ROUNDS):
         target, offset = metres - weight @ metres, points - weight @ points
         attitude = (target * weight[:, None]).T @ offset
@@ -247,7 +247,7 @@ def _fit(
     sigma = max(float(np.median(residual)) / _MAXWELL_MEDIAN, _GPS_M)
     count = min(len(metres), _INDEPENDENT) / sigma**2
     spread = (turned * weight[:, None]).T @ turned
-    return count * scale * attitude, count * (np.trace(spread) * np.eye(3) - spread), scale
+    return np.asarray(count * scale * attitude), count * (np.trace(spread) * np.eye(3) - spread), scale
 
 
 def _compass(

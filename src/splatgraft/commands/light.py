@@ -151,7 +151,7 @@ def _light_at(
     given = step.given()
     if given is not None:
         return given, given.ambient_radiance(directions.reshape(-1, 3)).reshape(directions.shape)
-    captured = CapturedScene(scene, cameras)
+    captured = CapturedScene(scene, cameras, read_clock_sun(step.cameras) if step.cameras else None)
     found = estimate_light(captured, place, sun_through=step.options.sun_through)
     if isinstance(found, NoLight):
         raise ValueError(f"--at: expected a place with light around it, found none. {found.reason}")

@@ -17,6 +17,7 @@ from torch import Tensor
 from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras
+from splatgraft.core.clock_sun import ClockSun
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.memo import Memo
 from splatgraft.editor.scene_cache import SceneCache
@@ -93,8 +94,8 @@ def largest_coverage_indices(gaussians: Gaussians, budget: int) -> Int[Tensor, "
 class _TransferValues:
     """The values of the last transfer, of which the next one takes what still holds."""
 
-    def __init__(self) -> None:
-        self._memo = Memo()
+    def __init__(self, clock: Callable[[], ClockSun | None]) -> None:
+        self._memo, self._clock = Memo(), clock
 
     def is_moved(self, composite: Composite, cameras: Cameras, light: Light | None, options: RelightOptions) -> bool:
         """Whether objects were moved since the light of the scene was found."""
@@ -143,7 +144,7 @@ class _TransferValues:
         captured = self._memo.get(
             "captured",
             (composite.target, composite.erased, cameras),
-            lambda: CapturedScene(composite.target.select(~composite.erased), cameras),
+            lambda: CapturedScene(composite.target.select(~composite.erased), cameras, self._clock()),
         )
         found = find_scene_light(captured, spheres, light=light, reach=options.reach, sun_through=options.sun_through)
         if isinstance(found, SceneLight):
@@ -178,7 +179,7 @@ class RelitPreview:
     def __init__(self, scenes: SceneCache) -> None:
         """Start with empty memos."""
         self._scenes = scenes
-        self._full_values, self._draft_values = _TransferValues(), _TransferValues()
+        self._full_values, self._draft_values = (_TransferValues(scenes.target_clock) for _ in range(2))
         self._memo = Memo()
         self._full_lock, self._draft_lock = threading.RLock(), threading.RLock()
 

@@ -13,6 +13,7 @@ from splatgraft.compositing.composite import Composite
 from splatgraft.composition import compose, object_base
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.clock_sun import ClockSun
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.editor.memo import Memo
@@ -20,6 +21,7 @@ from splatgraft.editor.placement import PlaceableObject
 from splatgraft.editor.project import ProjectFiles
 from splatgraft.editor.scene_sample import SceneSample, read_sample
 from splatgraft.editor.state import EditState
+from splatgraft.folders.clock_sun import clock_sun_path, read_clock_sun
 from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.project.gaussian_flags import read_flags
 from splatgraft.project.placement import ObjectPlacement
@@ -135,8 +137,16 @@ class SceneCache:
         if not any(own) or not self.files.surroundings.is_file():
             return [None] * len(own)
         inputs = (self.gaussians(self.files.surroundings), self.cameras(self.files.source_cameras))
-        source = self.derive("source", inputs, lambda: SourceScene(*inputs))
+        clock = self._clock(self.files.source_cameras)
+        source = self.derive("source", (*inputs, clock), lambda: SourceScene(*inputs, clock=clock))
         return [source if flag else None for flag in own]
+
+    def target_clock(self) -> ClockSun | None:
+        """The sun by the clock of the target's photos."""
+        return self._clock(self.files.target_cameras)
+
+    def _clock(self, cameras: Path) -> ClockSun | None:
+        return self._read("clock", clock_sun_path(cameras), read_clock_sun)
 
     def derive(self, name: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
         """The memoised result of `make`, computed again when one of `inputs` is another object."""

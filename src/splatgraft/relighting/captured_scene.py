@@ -12,6 +12,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.clock_sun import ClockSun
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.relighting.normals import Normals, estimate_normals
 from splatgraft.rendering import Render, render
@@ -26,17 +27,19 @@ class CapturedScene:
 
     gaussians: Gaussians
     cameras: Cameras
+    clock: ClockSun | None = None
+    """The sun by the clock of the photos, if they have time and place."""
 
     @cached_property
     def up(self) -> Float[Tensor, "3"]:
-        """Unit up direction, estimated from the cameras."""
-        return estimate_up(self.cameras)
+        """Unit up direction, by the photos' positions if these are known, otherwise estimated from the cameras."""
+        return estimate_up(self.cameras) if self.clock is None else torch.tensor(self.clock.up)
 
     @cached_property
     def usable(self) -> "CapturedScene":
         """The scene without Gaussians whose values are not finite or absurdly large."""
         good = _are_usable(self.gaussians)
-        return self if bool(good.all()) else CapturedScene(self.gaussians.select(good), self.cameras)
+        return self if bool(good.all()) else replace(self, gaussians=self.gaussians.select(good))
 
     @cached_property
     def normals(self) -> Normals:
@@ -71,7 +74,7 @@ class CapturedScene:
 
     def with_object(self, thing: Gaussians) -> "CapturedScene":
         """Add the Gaussians of an object after those of the scene."""
-        return CapturedScene(concatenate([self.gaussians, thing]), self.cameras)
+        return replace(self, gaussians=concatenate([self.gaussians, thing]))
 
 
 def _are_usable(gaussians: Gaussians) -> Bool[Tensor, "n"]:

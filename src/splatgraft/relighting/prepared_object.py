@@ -16,6 +16,7 @@ from splatgraft.compositing.composite import PlacedObject
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.clock_sun import ClockSun
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting.captured_scene import CapturedScene
@@ -47,6 +48,8 @@ class SourceScene:
     """Known light at the object's place; None to estimate it."""
     normals: Float[Tensor, "n 3"] | None = None
     """Known normals of the object's Gaussians, unit, outward; None to estimate them."""
+    clock: ClockSun | None = None
+    """The sun by the clock of the photos, evidence for the estimate."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +126,8 @@ def find_source_light(object_gaussians: Gaussians, source: SourceScene | None) -
         return None
     if source.light is not None:
         return source.light
-    place, captured = bounding_sphere(object_gaussians), CapturedScene(source.gaussians, source.cameras)
-    return estimate_light(captured, place, object_gaussians=object_gaussians)
+    captured = CapturedScene(source.gaussians, source.cameras, source.clock)
+    return estimate_light(captured, bounding_sphere(object_gaussians), object_gaussians=object_gaussians)
 
 
 def prepare_object(

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from splatgraft.compositing.composite import Composite
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras
+from splatgraft.core.clock_sun import ClockSun
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.cast_shadows import cast_shadows
 from splatgraft.relighting.layers import Relit, assemble_layers, pasted
@@ -53,6 +54,7 @@ def relight(
     *,
     sources: Sequence[SourceScene | None] = (),
     light: Light | None = None,
+    clock: ClockSun | None = None,
     options: RelightOptions = RelightOptions(),
 ) -> Relit:
     """Light the objects of a composite by the target scene, and add their shadows and reflected light to it.
@@ -65,6 +67,7 @@ def relight(
         sources: For each object the scene that it was taken from, without the object; its light is divided out. None
             if the scene is unknown, or no sources at all: the object then keeps its mean brightness.
         light: The light at the objects' place; None to estimate it from the target.
+        clock: The sun by the clock of the target's photos, evidence for the estimate.
         options: Length of shadows, sun, and number of Gaussians that may be added.
 
     Returns:
@@ -81,7 +84,7 @@ def relight(
     placed = [(i, p, s) for i, (p, s) in enumerate(zip(composite.objects, given, strict=True), 1) if p.gaussians.count]
     if not placed:
         return pasted(composite, "No object is placed: nothing to light.")
-    captured = CapturedScene(composite.target.select(~composite.erased), cameras)
+    captured = CapturedScene(composite.target.select(~composite.erased), cameras, clock)
     spheres = [bounding_sphere(one.in_target()) for _, one, _ in placed]
     scene = find_scene_light(captured, spheres, light=light, reach=options.reach, sun_through=options.sun_through)
     if isinstance(scene, NoLight):

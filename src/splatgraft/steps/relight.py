@@ -11,7 +11,7 @@ from splatgraft.compositing.composite import Composite
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.images import write_image
 from splatgraft.folders.capture_files import camera_files
-from splatgraft.folders.clock_sun import read_clock_sun
+from splatgraft.folders.clock_sun import clock_sun_path, read_clock_sun
 from splatgraft.folders.composite_folder import placement_files, read_composite
 from splatgraft.formats import read_cameras, read_gaussians, write_gaussians
 from splatgraft.project.gaussian_flags import write_flags
@@ -61,7 +61,8 @@ class Relight:
         source += () if self.object_cameras is None else camera_files(self.object_cameras)
         placement = placement_files(self.placement)
         light = () if self.given_light is None else (self.given_light,)
-        scenes = {"target": (self.target,), "placement": placement}
+        clocks = (clock_sun_path(path) for path in (self.cameras, self.object_cameras) if path is not None)
+        scenes = {"target": (self.target,), "placement": placement, "clock": tuple(filter(Path.is_file, clocks))}
         return scenes | {"cameras": camera_files(self.cameras), "source": source, "light": light}
 
     def write(self, folder: Path, context: Context) -> None:
@@ -73,14 +74,14 @@ class Relight:
             notes = (Note("The light transfer was off: the object is pasted as it was captured."),)
         else:
             cameras, sources = read_cameras(self.cameras), self._sources()
-            relit = relight(composite, cameras, sources=sources, light=self.given(), options=self.options)
+            clock = read_clock_sun(self.cameras)
+            relit = relight(composite, cameras, sources=sources, light=self.given(), clock=clock, options=self.options)
             found = relit.light
             gaussians, is_object = relit.bake(self.weights)
             notes = relit.report
             _draw_lights(folder, relit, composite, sources)
-            sun = read_clock_sun(self.cameras)
-            if sun is not None:  # not among the notes: light.txt is part of the report, which can be shared
-                context.console.say(f"By the clock of the target's photos: {sun.describe(cameras)}.")
+            if clock is not None:  # not among the notes: light.txt is part of the report, which can be shared
+                context.console.say(f"By the clock of the target's photos: {clock.describe(cameras)}.")
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_flags(folder / IS_OBJECT_FILE, is_object)
         (folder / LIGHT_TEXT_FILE).write_text("".join(f"{note.text}\n" for note in notes))
@@ -102,7 +103,11 @@ class Relight:
         if self.surroundings is not None:
             if self.object_cameras is None:
                 raise ValueError("--surroundings: expected --object-cameras beside it, found none")
-            source = SourceScene(read_gaussians(self.surroundings), read_cameras(self.object_cameras))
+            source = SourceScene(
+                read_gaussians(self.surroundings),
+                read_cameras(self.object_cameras),
+                clock=read_clock_sun(self.object_cameras),
+            )
         paths = [item.object_path for item in read_placement(self.placement).objects]
         taken = self.taken or (paths[0] if paths else None)
         if taken is None:

@@ -5,8 +5,10 @@ truth. Errors of the estimated light (its irradiance without occlusion) and of n
 """
 
 import math
+import random
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
@@ -15,6 +17,7 @@ from torch import Tensor
 
 from splatgraft.compositing.contact import flatten_contact_layers
 from splatgraft.consolidation import ConsolidateOptions, consolidate
+from splatgraft.core.clock_sun import ClockSun, SunCandidate
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear, write_image
@@ -25,6 +28,7 @@ from splatgraft_paper.benchmark.measure import measure_view
 from splatgraft_paper.benchmark.transplat import relight_by_irradiance_ratio
 from splatgraft_paper.exam.scenes import ExamScene, TrueView
 from splatgraft_paper.peers.deferred_reflection import ReflectiveScene, fit_reflections, insert
+from splatgraft_paper.synthesis.places import OUTDOORS
 
 ROWS: Mapping[str, str] = {
     "paste": "the object as it was captured",
@@ -32,6 +36,7 @@ ROWS: Mapping[str, str] = {
     "transplat": "the ratio of irradiances at each normal (TranSplat's diffuse path), both estimated; no shadow",
     "3dgs-dr": "3DGS-DR: the object reflects an environment that is fitted to the target's photos; no shadow",
     "transfer": "the transfer, everything estimated",
+    "clock": "the transfer with a simulated clock of the photos: height exact, azimuth off by about 5 degrees",
     "true-new-light": "the transfer with the ground-truth new light",
     "true-lights": "the transfer with both ground-truth lights",
     "true-lights-and-normals": "the transfer with both ground-truth lights and the ground-truth normals",
@@ -52,8 +57,27 @@ def make_row(row: str, scene: ExamScene) -> tuple[Gaussians | ReflectiveScene, R
     if row == "fitted":
         return _fitted_to_truth(scene), None
     source, light = _with_truth(row, scene)
-    relit = relight(scene.composite, scene.cameras, sources=[source], light=light)
+    clock = _simulated_clock(scene) if row == "clock" else None
+    relit = relight(scene.composite, scene.cameras, sources=[source], light=light, clock=clock)
     return relit.bake()[0], relit
+
+
+def _simulated_clock(scene: ExamScene) -> ClockSun:
+    """Turn the brightest source of the true new light about the vertical, at random by the scene's name.
+
+    The source is also taken where clouds hide the sun. The scenes' vertical is the z axis.
+
+    Raises:
+        ValueError: The scene is a room, or has no source above the horizon.
+    """
+    above = [one for one in scene.new_light.sources if one.direction[2] > 0]
+    if not above or scene.name.rpartition("_")[2] not in OUTDOORS:
+        raise ValueError("there is no sun")
+    x, y, z = max(above, key=lambda one: one.luminance).direction
+    angle = math.radians(random.Random(scene.name).gauss(0, _CLOCK_ERROR_DEG))
+    turned = (math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y, z)
+    candidate = SunCandidate(datetime(2000, 1, 1, tzinfo=UTC), "simulation", math.degrees(math.asin(z)), turned)
+    return ClockSun((candidate,), (0.0, 0.0, 1.0), _CLOCK_ERROR_DEG, "simulation", None)
 
 
 def _with_reflections(scene: ExamScene) -> ReflectiveScene:
@@ -89,7 +113,7 @@ def _fitted_to_truth(scene: ExamScene) -> Gaussians:
 
 def _with_truth(row: str, scene: ExamScene) -> tuple[SourceScene, Light | None]:
     with_light = replace(scene.source, light=scene.old_light)
-    if row == "transfer":
+    if row in ("transfer", "clock"):
         return scene.source, None
     if row == "true-new-light":
         return scene.source, scene.new_light
@@ -107,6 +131,7 @@ LIGHT_ROW = "transfer"
 METRICS = {"object": "psnr_object", "whole": "psnr_whole", "shadow": "shadow_ratio_rmse"}
 """Names in `measure_view` of a row's values: PSNR in dB of object and whole image, error of the shadow's strength."""
 _PICTURED = ("paste", "transfer", "true-lights-and-normals")
+_CLOCK_ERROR_DEG = 5.0  # standard deviation of the simulated clock's azimuth
 _OPAQUE = 0.3  # minimum opacity of a Gaussian whose normal is measured
 
 

@@ -42,7 +42,7 @@ from splatgraft.relighting.light.panorama import (
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
-from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, with_sun
+from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, sun_by_clock, with_sun
 from splatgraft.rendering import render
 
 # the evidence; set by hand
@@ -160,7 +160,7 @@ def estimate_light(
     sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, place)
-    sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
+    sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region) or sun_by_clock(mean, whole)
     return found if sun is None else found.with_sun(sun, scene)
 
 
