@@ -75,11 +75,11 @@ def test_relit_sources_have_the_paper_s_amounts(tmp_path):
 
 
 def test_the_empty_prompt_has_256_tokens(tmp_path, monkeypatch):
-    def embedded(base, tokenizer, encoder, length, *, number=""):
-        width = 768 if encoder == "CLIPTextModel" else 4096
-        return SimpleNamespace(last_hidden_state=torch.ones(1, length, width), pooler_output=torch.ones(1, width))
+    def embedded(base, text):
+        width = 768 if text.encoder == "CLIPTextModel" else 4096
+        return SimpleNamespace(last_hidden_state=torch.ones(1, text.tokens, width), pooler_output=torch.ones(1, width))
 
-    monkeypatch.setattr("splatgraft_paper.commands.train._embed", embedded)
+    monkeypatch.setattr("splatgraft.harmonization.flux.prompt.embed_text", embedded)
     assert main(["paper", "train", "embed", str(tmp_path / "prompt.safetensors")]) == 0
     # FLUX.1-schnell was distilled at 256; diffusers' default is 512
     prompt = read_prompt(tmp_path / "prompt.safetensors", tokens_width=4096, pooled_width=768)
