@@ -122,6 +122,24 @@ def test_lpips_moves_the_image_towards_the_target(weights):
     assert float(after) < float(before.detach())
 
 
+def test_the_networks_weights_are_copied_once(weights, monkeypatch):
+    loss, copied, original = lpips_vgg(weights), [], torch.Tensor.to
+
+    def to(tensor, *where, **options):
+        moved = original(tensor, *where, **options)
+        copied.append(0 if moved is tensor else moved.numel())
+        return moved
+
+    monkeypatch.setattr(torch.Tensor, "to", to)
+    image, target = noise(16, 16, 3, seed=0).double(), noise(16, 16, 3, seed=1).double()
+    first = loss(image, target)
+    # VGG-16's convolutions have 14.7 million weights
+    assert 14e6 < sum(copied) < 16e6
+    copied.clear()
+    assert loss(image, target) == first
+    assert sum(copied) < 1000
+
+
 def test_lpips_says_where_missing_weights_belong(tmp_path):
     with pytest.raises(ValueError, match=rf"{VGG_FILE}: expected weights .* put both there") as caught:
         lpips_vgg(tmp_path)

@@ -9,7 +9,8 @@ import torch
 
 pytest.importorskip("diffusers")
 
-from tiny_models import CHANNELS, flux_folder, quiet, tiny_autoencoder, tiny_transformer
+from huggingface_hub.utils import filter_repo_objects
+from tiny_models import CHANNELS, flux_folder, kontext_folder, quiet, tiny_autoencoder, tiny_transformer
 
 from splatgraft.harmonization import (
     FluxOptions,
@@ -124,6 +125,46 @@ def test_weights_kept_in_eight_bits_give_about_the_same(folder):
     assert 0 < (image - flux(folder).harmonize(view()).image).abs().mean() < 0.05
 
 
+def no_hub(repository, patterns, say):
+    raise ValueError(f"{repository}: expected a network, found none")
+
+
+def test_the_empty_prompt_is_looked_for_before_the_weights_are_fetched(tmp_path, monkeypatch):
+    monkeypatch.setattr("pathlib.Path.home", lambda: tmp_path)
+    fetched = []
+
+    def hub(repository, patterns, say):
+        files = ["vae/config.json", *(f"image-mask/{name}" for name in ("config.json", "a-00001-of-2.safetensors"))]
+        fetched.extend(filter_repo_objects(files if "dot3d" in repository else (), allow_patterns=list(patterns)))
+        return tmp_path / "hub"
+
+    monkeypatch.setattr("splatgraft.harmonization.flux.loading.hub_folder", hub)
+    with pytest.raises(
+        ValueError, match=r"expected the empty prompt's embeddings, found none; .*(?:text_encoder|tokenizer)"
+    ):
+        flux("dot3d")
+    assert fetched
+    assert all(name.endswith(".json") for name in fetched)
+
+
+def test_the_empty_prompt_is_made_once_where_the_base_has_text_encoders(folder, tmp_path):
+    base = kontext_folder(tmp_path / "base")
+    tiny_transformer(WIDE).save_pretrained(tmp_path / "bare" / "image-mask")
+    said = []
+    made = flux(tmp_path / "bare" / "image-mask", base=str(base), say=said.append)
+    assert made.network.prompt.tokens.shape[0] == 256
+    assert made.harmonize(view()).image.shape == (32, 48, 3)
+    flux(tmp_path / "bare" / "image-mask", base=str(base), say=said.append)
+    assert sum("embed the empty prompt once" in line for line in said) == 1
+
+
+def test_channels_are_those_of_the_weights_not_of_the_base_s_config(folder, tmp_path):
+    wanted = flux(folder).harmonize(view()).image
+    shutil.copytree(folder, tmp_path / "image-mask")
+    edit(tmp_path / "image-mask" / CONFIG, in_channels=16, out_channels=None)
+    assert torch.equal(flux(tmp_path / "image-mask").harmonize(view()).image, wanted)
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[:-100])
 
@@ -143,10 +184,13 @@ REFUSED = {
         "expected the config of a FluxTransformer2DModel, found UNet2DConditionModel",
     ),
     "another width": (
-        lambda folder: edit(folder / CONFIG, in_channels=32),
-        r"expected in_channels of 16 \(FLUX\) or 48 \(a harmoniser\) in config.json, found 32",
+        lambda folder: tiny_transformer(32).save_pretrained(folder / "transformer"),
+        r"expected in_channels of 16 \(FLUX\) or 48 \(a harmoniser\), found 32",
     ),
-    "FLUX itself": (lambda folder: edit(folder / CONFIG, in_channels=16), "expected a harmoniser, found FLUX itself"),
+    "FLUX itself": (
+        lambda folder: tiny_transformer(16).save_pretrained(folder / "transformer"),
+        "expected a harmoniser, found FLUX itself",
+    ),
     "FLUX.1-dev": (lambda folder: edit(folder / CONFIG, guidance_embeds=True), "found one with guidance"),
     "no prompt": (
         lambda folder: (folder / "empty_prompt.safetensors").unlink(),
@@ -170,6 +214,7 @@ REFUSED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_broken_folder_is_one_line_that_names_the_file(folder, tmp_path, monkeypatch, name):
     monkeypatch.setattr("pathlib.Path.home", lambda: tmp_path / "image-mask")
+    monkeypatch.setattr("splatgraft.harmonization.flux.loading.hub_folder", no_hub)
     how, line = REFUSED[name]
     shutil.copytree(folder, tmp_path / "image-mask")
     how(tmp_path / "image-mask")

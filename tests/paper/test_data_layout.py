@@ -1,13 +1,25 @@
 """Scenes of the authors' data set, matching of pictures to views, and the paper's numbers."""
 
+import json
+from functools import partial
+from pathlib import Path
+
 import pytest
 import torch
 from paper_data import put
+from shapes import ring
+from tiny_project import ball, plane
 
+from splatgraft.cli import main
+from splatgraft.core.gaussians import concatenate
+from splatgraft.formats import read_cameras, read_gaussians, write_cameras
+from splatgraft.rendering import render
+from splatgraft.steps.segment import Segment
 from splatgraft_paper.tables.layout import find_scenes, held_out_stems, match_views, pictures
 from splatgraft_paper.tables.measure_pictures import padded_ssim
 from splatgraft_paper.tables.paper_numbers import ROTATION, SYNTHETIC, UPDATES, published_name
 
+SOFA, TRUCK = "bathtub_57e_in_blend_57eadb", "truck_in_garden"
 GREY = torch.full((12, 16, 3), 0.5)
 
 
@@ -72,3 +84,90 @@ def test_padded_ssim_counts_border_pixels_beside_zeros():
     )
     # float32 against float64: 1e-6 of values up to 1, divided by the constant 0.03^2 at worst
     assert float(padded_ssim(a, b)) == pytest.approx(float(wanted[5:-5, 5:-5].mean()), abs=1e-4)
+
+
+def tables(data, out, *words):
+    """Run the command on pictures alone; returns its exit code and paper.json."""
+    code = main(["paper", "tables", "--data", str(data), "--out", str(out), "--measure-only", *words])
+    return code, json.loads((out / "paper.json").read_text())
+
+
+LAYOUTS = {
+    # truth, the authors' pictures of a scene and of a pose, poses, names
+    "as documented": ("gt", "{method}/{scene}", "ours/yard/{pose}", "yard/{pose}", ()),
+    "scene first, flat poses": ("GT", "{scene}/{method}", "yard_{pose}/ours", "yard_{pose}", ("truth=GT",)),
+    "deeper": (
+        *("test/gt", "{method}/{scene}/test/renders", "yard/{pose}/test/renders", "yard/{pose}"),
+        ("truth=test/gt", "results=test/renders"),
+    ),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_each_layout_of_the_data_set_is_measured(tmp_path, layout):
+    truth, shown, turned, pose_folder, names = LAYOUTS[layout]
+    data, poses = tmp_path / "data", ("000", "120", "240")
+    for stem in ("0", "1"):
+        put(data / "data_3d/synthetic/insertions" / SOFA / truth / f"{stem}.png", GREY)
+        for method in ("ours", "gs-ir"):
+            place = shown.format(method=method, scene=SOFA)
+            put(data / "results_3d/synthetic" / place / f"{stem}.png", GREY * 0.8)
+        for pose in poses:
+            put(data / "data_rotation" / pose_folder.format(pose=pose) / truth / f"{stem}.png", GREY)
+            put(data / "results_rotation" / turned.format(pose=pose) / f"{stem}.png", GREY * 0.8)
+    code, found = tables(data, tmp_path / "a" / "new" / "folder", *(["--names", *names] if names else []))
+    assert code == 0
+    rows = {(row["scene"], row["method"], row["pose"]) for row in found["measured"]}
+    assert rows == {(SOFA, "Ours", ""), (SOFA, "GS-IR", "")} | {
+        (f"yard_{pose}", "Ours", f"P{number}") for number, pose in enumerate(poses)
+    }
+    assert "1 of 9 synthetic, 0 of 7 real, 3 of 9 rotation" in found["notes"][0]
+
+
+def test_other_names_end_in_exit_1_with_the_names_that_are_there(tmp_path, capsys):
+    data = tmp_path / "data"
+    for name in ("GT", "alpha"):
+        put(data / "data_3d/synthetic/insertions" / SOFA / name / "0.png", GREY)
+        put(data / "data_rotation/yard_0" / name / "0.png", GREY)
+    code, found = tables(data, tmp_path / "out")
+    assert code == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"{SOFA}: expected gt/ (truth), found GT/, alpha/; other names: --names truth=NAME" in said
+    assert "0 of 9 synthetic, 0 of 7 real, 0 of 9 rotation" in found["notes"][0]
+    assert main(["paper", "tables", "--data", str(data), "--names", "truht=GT"]) == 2
+    assert "expected ROLE=NAME with ROLE of truth, background" in capsys.readouterr().err
+
+
+def test_scenes_are_compared_with_those_that_the_data_set_s_card_names(tmp_path):
+    for name in (TRUCK, "chair_in_attic"):
+        put(tmp_path / "data/data_3d/real/insertions" / name / "composite/0.png", GREY)
+    code, found = tables(tmp_path / "data", tmp_path / "out")
+    assert code == 0
+    absent, others = found["notes"][1:3]
+    assert "desk_in_london_bedroom, locomotive_in_train" in absent
+    assert TRUCK not in absent
+    assert others == "Real scenes that its card does not name: chair_in_attic."
+
+
+def test_our_methods_run_on_pasted_pictures_and_masks_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr("splatgraft_paper.benchmark.scene.Segment", partial(Segment, solidify=4))
+    scene = tmp_path / "data/data_3d/real/insertions" / TRUCK
+    ground, thing, cameras = plane((0.6, 0.6, 0.7)), ball(), ring(10, radius=1.6, height=1.0, size=(48, 36), focal=45.0)
+    both = concatenate([ground, thing])
+    is_object = (torch.arange(both.count) >= ground.count)[:, None].float()
+    pasted, empty = render(both, cameras, features=is_object), render(ground, cameras)
+    for index, name in enumerate(cameras.names):
+        stem = Path(name).stem
+        put(scene / "composite" / f"{stem}.png", pasted.color[index].clamp(0, 1))
+        put(scene / "background" / f"{stem}.png", empty.color[index].clamp(0, 1))
+        put(scene / "masks" / f"{stem}.png", pasted.features[index].expand(-1, -1, 3).clamp(0, 1))
+    write_cameras(scene / "transforms.json", cameras)
+    words = ["--iterations", "40", "--budget", "400", "--device", "cpu"]
+    data = ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
+    assert main(["paper", "tables", *data, "--methods", "transfer", *words]) == 0
+    work = tmp_path / "out/scenes" / TRUCK
+    assert len(list((work / "pictures/transfer").glob("*.png"))) == 2
+    # the object is cut out at its place, without the two held-out views; the ball's centre is 0.3 above the ground
+    assert len(read_cameras(work / "source/capture")) == 8
+    means = read_gaussians(work / "object/object.ply").means
+    assert torch.allclose(means.median(0).values, torch.tensor([0, 0, 0.3]), atol=0.15)

@@ -94,7 +94,7 @@ def test_pictures_of_another_size_or_of_other_views_are_said_and_leave_their_cel
         put(root / "results_3d/synthetic/ours" / PLAIN / f"{stem}.png", truth[:100])
         put(root / "results_3d/synthetic/gs_ir" / PLAIN / f"other_{stem}.png", truth)
     command = replace(measured, data=root, out=tmp_path / "out")
-    assert command.execute(Console()) == 0
+    assert command.execute(Console()) == 1
     _, found = by_scene_and_method(command)
     reasons = {row["method"]: row["reason"] for row in found["missing"]}
     assert "expected 224x100 pixels as the method's picture, found 224x158" in reasons["Ours"]

@@ -20,6 +20,7 @@ from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
 from splatgraft.steps.harmonize import Harmonize
 from splatgraft_paper.commands.consolidate import Consolidate
+from splatgraft_paper.consolidation import descend_as_paper
 
 pytestmark = list(quiet)
 
@@ -44,6 +45,14 @@ def test_every_update_begins_at_the_noise_of_the_schedule_on_renders_of_the_scen
         return original(self, view, strength)
 
     monkeypatch.setattr(FluxHarmonizer, "harmonize_from", watched)
+    descents = []
+
+    def descend(composite, cameras, images, settings, **services):
+        made = descend_as_paper(composite, cameras, images, settings, **services)
+        descents.append((composite.sh, made.sh, settings))
+        return made
+
+    monkeypatch.setattr("splatgraft_paper.commands.consolidate.descend_as_paper", descend)
     options = {"loss": "l1-dssim", "iterations": 20}
     once = perform(consolidation(finished_project, harmonized, tmp_path / "once", **options), Console())
     step = consolidation(
@@ -60,7 +69,13 @@ def test_every_update_begins_at_the_noise_of_the_schedule_on_renders_of_the_scen
     begun = render(read_gaussians(once / "scene.ply"), views.cameras[0]).color[0].clamp(0, 1)
     assert torch.allclose(first.prior, begun, atol=1e-4)
     assert not torch.allclose(second.prior, first.prior, atol=1e-3)
-    assert not torch.equal(read_gaussians(once / "scene.ply").sh, read_gaussians(thrice / "scene.ply").sh)
+    # each update goes on from the last state, with a fifth of the steps
+    assert [(settings.continued, settings.iterations) for *_, settings in descents[1:]] == [(False, 20)] + [
+        (True, 4)
+    ] * 2
+    assert torch.equal(descents[2][0], descents[1][1])
+    assert torch.equal(descents[3][0], descents[2][1])
+    assert torch.equal(read_gaussians(thrice / "scene.ply").sh, descents[3][1])
 
 
 def test_a_method_without_noise_begins_at_renders_too_and_says_so(finished_project, tmp_path, capsys):

@@ -101,6 +101,11 @@ def lpips_vgg(folder: Path | None = None) -> ImageLoss:
         for i, channels in enumerate(_VGG_CHANNELS)
     ]
 
+    @lru_cache(maxsize=2)  # copied to a device once, not at every call
+    def placed(device: torch.device, dtype: torch.dtype) -> tuple[list[list[list[Tensor]]], list[Tensor]]:
+        layers = [[[one.to(device, dtype) for one in pair] for pair in level] for level in convolutions]
+        return layers, [tap.to(device, dtype) for tap in taps]
+
     def features(image: Float[Tensor, "h w 3"]) -> list[Tensor]:
         """Compute activations (c, h', w') after each resolution's last convolution, normalised over the channels."""
         if min(image.shape[:2]) < 16:
@@ -109,18 +114,18 @@ def lpips_vgg(folder: Path | None = None) -> ImageLoss:
         shift, scale = image.new_tensor([-0.030, -0.088, -0.188]), image.new_tensor([0.458, 0.448, 0.450])
         x = ((2 * image - 1 - shift) / scale).permute(2, 0, 1)[None]
         found = []
-        for level, layers in enumerate(convolutions):
+        for level, layers in enumerate(placed(x.device, x.dtype)[0]):
             x = F.max_pool2d(x, 2) if level else x
             for weight, bias in layers:
-                x = F.relu(F.conv2d(x, weight.to(x), bias.to(x), padding=1))
+                x = F.relu(F.conv2d(x, weight, bias, padding=1))
             found.append((x / ((x**2).sum(1, keepdim=True) + 1e-20).sqrt())[0])
         return found
 
     def loss(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
         with torch.no_grad():
             wanted = features(target)
-        pairs = zip(features(image), wanted, taps, strict=True)
-        return torch.stack([F.conv2d(((a - b) ** 2)[None], tap.to(a)).mean() for a, b, tap in pairs]).sum()
+        pairs = zip(features(image), wanted, placed(image.device, image.dtype)[1], strict=True)
+        return torch.stack([F.conv2d(((a - b) ** 2)[None], tap).mean() for a, b, tap in pairs]).sum()
 
     return loss
 

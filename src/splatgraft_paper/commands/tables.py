@@ -16,7 +16,7 @@ from splatgraft_paper.benchmark.image_features import INCEPTION_FILE
 from splatgraft_paper.benchmark.methods import Method, MethodSettings
 from splatgraft_paper.benchmark.run import unmeasurable_metrics
 from splatgraft_paper.tables.data_ablation import DataAblation, measure_models
-from splatgraft_paper.tables.layout import PaperScene, find_scenes
+from splatgraft_paper.tables.layout import NAMES, PaperScene, find_scenes
 from splatgraft_paper.tables.our_pictures import OurRun
 from splatgraft_paper.tables.paper_numbers import published_name
 from splatgraft_paper.tables.report import write_paper_report
@@ -44,6 +44,9 @@ class EvaluatePaper:
     """Our methods to run, by the names of `paper benchmark`; off+flux/paper is the paper's own."""
     only: tuple[str, ...] = ()
     """Names of scenes; default: all."""
+    names: tuple[str, ...] = ()
+    """ROLE=NAME of what has another name below a scene, such as truth=GT or cameras=sparse/0; ROLE is truth,
+    background, composite, masks, object_scene, target_scene, cameras, placement or results (below METHOD/SCENE)."""
     all_views: bool = False
     """Measure all views, not only the held-out ones."""
     weights: Path | None = None
@@ -65,8 +68,8 @@ class EvaluatePaper:
     options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(quality="draft", device="auto"))
 
     def execute(self, console: Console) -> int:
-        """Measure and run what is missing and write the tables; return 1 if one of --methods could not run."""
-        scenes = self._chosen(find_scenes(self.data))
+        """Measure and run what is missing and write the tables; return 1 if a method failed or nothing was measured."""
+        scenes = self._chosen(find_scenes(self.data, _named(self.names)))
         missing_metrics = unmeasurable_metrics(self.weights)
         for name, reason in missing_metrics.items():
             console.say(f"{name}: not measured: {reason}")
@@ -91,8 +94,11 @@ class EvaluatePaper:
             )
             page = write_paper_report(self.out, found)
         console.result(page)
+        nothing = not found.measured and not found.by_model and any(scene.kind != "real" for scene in scenes)
         failed = not self.measure_only and any(method in found.ours for _, method in found.missing)
-        return 1 if failed else 0
+        for (scene, method), reason in found.missing.items() if nothing or failed else ():
+            console.say(f"{scene}, {method}: {reason}")
+        return 1 if failed or nothing else 0
 
     def _by_model(self, missing: Mapping[str, str], console: Console) -> dict[str, dict[str, float]]:
         """Measure the models of Table 3; empty without --models."""
@@ -120,6 +126,14 @@ class EvaluatePaper:
         if unknown := [name for name in self.only if name not in names]:
             raise ValueError(f"--only: expected names among {', '.join(names)}; found {unknown[0]}")
         return tuple(scene for scene in scenes if not self.only or scene.name in self.only)
+
+
+def _named(names: tuple[str, ...]) -> dict[str, str]:
+    """Parse --names."""
+    named = dict((text.partition("=")[0], text.partition("=")[2]) for text in names)
+    if not named.keys() <= NAMES.keys() or not all(named.values()):
+        raise ValueError(f"--names: expected ROLE=NAME with ROLE of {', '.join(NAMES)}, found {' '.join(names)}")
+    return named
 
 
 def _stand_ins(weights: Path | None, missing: Mapping[str, str]) -> frozenset[str]:

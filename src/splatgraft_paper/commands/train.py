@@ -3,13 +3,12 @@
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-import torch
 import tyro
 
+from splatgraft.harmonization.flux.prompt import TOKENS
 from splatgraft.project.step import Device, Positional, choose_device
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.hub import hub_id
@@ -111,47 +110,24 @@ class TrainEmbed:
     """File to write; default: the place where `harmonize` and `train` look for it."""
     base: str | None = None
     """Folder or hub id with the text encoders and tokenizers; default: the base model of --kind."""
-    tokens: int = 256
+    tokens: int = TOKENS
     """Length of FLUX's text sequence; schnell was distilled at 256."""
     kind: Literal["flux", "stable-diffusion"] = "flux"
     """Model whose text encoders are used; needs transformers (pip install 'splatgraft[text]')."""
 
     def execute(self, console: Console) -> int:
         """Write the file."""
-        from splatgraft.harmonization.flux.prompt import PromptEmbedding, prompt_file, write_prompt
+        from splatgraft.harmonization.flux.prompt import CLIP, embed_empty_prompt, embed_text, prompt_file, write_prompt
         from splatgraft.harmonization.flux.tensor_file import write_tensors
 
         base = hub_id(self.base or self.kind)
         out = self.out or prompt_file(base)
         out.parent.mkdir(parents=True, exist_ok=True)
-        console.say(f"{base}: CLIP embeds the empty prompt")
-        clip = _embed(base, "CLIPTokenizer", "CLIPTextModel", 77)  # the length of CLIP's text sequence
+        console.say(f"{base}: its text encoders embed the empty prompt")
         if self.kind == "flux":
-            console.say(f"{base}: T5 embeds the empty prompt")
-            tokens = _embed(base, "T5TokenizerFast", "T5EncoderModel", self.tokens, number="_2").last_hidden_state[0]
-            write_prompt(out, PromptEmbedding(tokens.float(), clip.pooler_output[0].float()), base)
+            write_prompt(out, embed_empty_prompt(base, tokens=self.tokens), base)
         else:
-            write_tensors(out, {"tokens": clip.last_hidden_state[0].float()}, {"text": "", "source": base})
+            tokens = embed_text(base, CLIP).last_hidden_state[0].float()
+            write_tensors(out, {"tokens": tokens}, {"text": "", "source": base})
         console.result(out)
         return 0
-
-
-@torch.no_grad()
-def _embed(base: str, tokenizer: str, encoder: str, length: int, *, number: str = "") -> Any:
-    """Compute a text encoder's output for the empty prompt, padded to `length` tokens."""
-    # imported by name, because pyright would spend a third of its time on types that are not used
-    transformers: Any = import_module("transformers")
-
-    def load(kind: str, part: str) -> Any:
-        # transformers would make an empty tokenizer from a missing folder
-        if Path(base).is_dir() and not (Path(base) / part).is_dir():
-            raise ValueError(f"{base}: expected {kind} in {part}/, found no such folder")
-        try:
-            return getattr(transformers, kind).from_pretrained(base, subfolder=part)
-        except (OSError, ValueError) as error:
-            found = " ".join(str(error).split())[:160]
-            raise ValueError(f"{base}: expected {kind} in {part}/, found {found}") from error
-
-    texts = load(tokenizer, f"tokenizer{number}")
-    ids = texts([""], padding="max_length", max_length=length, return_tensors="pt").input_ids
-    return load(encoder, f"text_encoder{number}")(ids)

@@ -1,20 +1,21 @@
 """The authors' published data set on disk: finds its scenes and their files, and matches pictures to views.
 
-The data set is nviolante/dot3d on Hugging Face, CC-BY 4.0. Its card names the folders down to SCENE. It does not
-name the files below SCENE; the names here are ours, so files may have to be renamed:
+The data set is nviolante/dot3d on Hugging Face, CC-BY 4.0. Its card names the folders down to SCENE, and the scenes.
+It does not name what lies below a SCENE; those names are ours and can be replaced (`NAMES`):
 
     data_3d/{synthetic,real}/insertions/SCENE/      SCENE is OBJECT_in_BACKGROUND
-        gt/  background/  composite/                pictures VIEW.png: with the object, without it, pasted
+        gt/  background/  composite/  masks/        pictures VIEW.png: with the object, without it, pasted; its mask
         object.ply  background.ply                  trained Gaussians, the object at its place in the background
         transforms.json  placement.json             cameras of the views; pose of the object in the background
     data_3d/synthetic/scenes/{objects,backgrounds}/NAME     captures
-    data_rotation/SCENE/POSE/                       files of a SCENE; the poses' names sort in their order
-    results_3d/{synthetic,real}/METHOD/SCENE/VIEW.png       the authors' pictures
-    results_rotation/METHOD/SCENE/POSE/VIEW.png
+    data_rotation/SCENE/POSE/  or SCENE_POSE/       files of a SCENE; the poses' names sort in their order
+    results_3d/{synthetic,real}/METHOD/SCENE/       the authors' pictures VIEW.png; METHOD and SCENE in either order,
+    results_rotation/METHOD/SCENE/POSE/             and further folders below; without a METHOD they are of "Ours"
 """
 
+import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -29,13 +30,15 @@ from splatgraft_paper.tables.paper_numbers import published_name
 
 Kind = Literal["synthetic", "real", "rotation"]
 _PARTS = ("data_3d", "data_rotation", "results_3d", "results_rotation")
-_PICTURES = {"truth": "gt", "background": "background", "composite": "composite"}
+_PICTURES = {"truth": "gt", "background": "background", "composite": "composite", "masks": "masks"}
 _FILES = {
     "object_scene": "object.ply",
     "target_scene": "background.ply",
     "cameras": "transforms.json",
     "placement": PLACEMENT_FILE,
 }
+NAMES = {**_PICTURES, **_FILES, "results": ""}
+"""Path below a scene's folder by role; `results` is the path of the pictures below METHOD/SCENE."""
 
 
 @dataclass(frozen=True)
@@ -47,44 +50,110 @@ class PaperScene:
     pose: str = ""
     """P0, P1 or P2 in the rotation experiment."""
     folders: Mapping[str, Path] = field(default_factory=dict)
-    """Folders of pictures by role: truth, composite, background."""
+    """Folders of pictures by role: truth, composite, background, masks."""
     files: Mapping[str, Path] = field(default_factory=dict)
     """Files by role: target_scene, object_scene (trained .ply), cameras, placement, source_capture, target_capture."""
     results: Mapping[str, Path] = field(default_factory=dict)
     """Folders of the authors' pictures by method."""
+    lacks: str = ""
+    """Reason why nothing can be measured on the scene, with the names that its folder has; else empty."""
 
 
-def find_scenes(folder: Path) -> tuple[PaperScene, ...]:
-    """List the scenes of the data set in `folder`, or in dot3d_data/ there."""
+def find_scenes(folder: Path, names: Mapping[str, str] = {}) -> tuple[PaperScene, ...]:
+    """List the scenes of the data set in `folder`, or in dot3d_data/ there; `names` replaces some of `NAMES`."""
     root = next(
         (root for root in (folder, folder / "dot3d_data") if any((root / p).is_dir() for p in _PARTS[:2])), None
     )
     if root is None:
         raise ValueError(f"{folder}: expected {_PARTS[0]} or {_PARTS[1]} in it, found neither")
+    found = _Finder(root, {**NAMES, **names})
     scenes: list[PaperScene] = []
     for kind in ("synthetic", "real"):
+        shown = found.shown(root / "results_3d" / kind)
         for path in _subfolders(root / "data_3d" / kind / "insertions"):
-            scenes.append(_scene(root, kind, path.name, path, root / "results_3d" / kind))
-    for place in _subfolders(root / "data_rotation"):
-        for number, path in enumerate(_subfolders(place)):
-            results = root / "results_rotation"
-            scenes.append(_scene(root, "rotation", f"{place.name}/{path.name}", path, results, pose=f"P{number}"))
+            scenes.append(found.scene(kind, (path.name,), path, shown))
+    shown = found.shown(root / "results_rotation")
+    for place, poses in found.rotations().items():
+        for number, (pose, path) in enumerate(poses):
+            scenes.append(found.scene("rotation", (place, pose), path, shown, pose=f"P{number}"))
+    if not scenes:
+        raise ValueError(f"{root}: expected folders of scenes in data_3d/KIND/insertions or data_rotation, found none")
     return tuple(scenes)
 
 
-def _scene(root: Path, kind: Kind, name: str, folder: Path, results: Path, pose: str = "") -> PaperScene:
-    folders = {role: folder / name for role, name in _PICTURES.items() if (folder / name).is_dir()}
-    files = {role: folder / name for role, name in _FILES.items() if (folder / name).is_file()}
-    thing, _, background = name.partition("_in_")
-    captures = root / "data_3d" / "synthetic" / "scenes"
-    for role, path in {
-        "source_capture": captures / "objects" / thing,
-        "target_capture": captures / "backgrounds" / background,
-    }.items():
-        if background and path.is_dir():
-            files[role] = path
-    shown = {published_name(method.name): method / name for method in _subfolders(results) if (method / name).is_dir()}
-    return PaperScene(name.replace("/", "_"), kind, pose, folders, files, shown)
+@dataclass(frozen=True)
+class _Finder:
+    """Search for the files of scenes below a root, by their names."""
+
+    root: Path
+    names: Mapping[str, str]
+
+    def shown(self, results: Path) -> dict[tuple[str, ...], Path]:
+        """List the folders of pictures below `results` by the parts of their path, without the name for `results`."""
+        inner = Path(self.names["results"]).parts
+        found: dict[tuple[str, ...], Path] = {}
+        for path in _picture_folders(results):
+            parts = path.relative_to(results).parts
+            if parts[len(parts) - len(inner) :] == inner:
+                found[parts[: len(parts) - len(inner)]] = path
+        return found
+
+    def rotations(self) -> dict[str, list[tuple[str, Path]]]:
+        """List the poses by scene, from SCENE/POSE or SCENE_POSE; a folder with files of a scene is one pose."""
+        poses: dict[str, list[tuple[str, Path]]] = {}
+        for path in _subfolders(self.root / "data_rotation"):
+            if any((path / self.names[role]).exists() for role in (*_PICTURES, *_FILES)):
+                place, _, pose = path.name.rpartition("_")
+                poses.setdefault(place or path.name, []).append((pose, path))
+            else:
+                poses[path.name] = [(below.name, below) for below in _subfolders(path)]
+        return poses
+
+    def scene(
+        self, kind: Kind, parts: tuple[str, ...], folder: Path, shown: Mapping[tuple[str, ...], Path], pose: str = ""
+    ) -> PaperScene:
+        """Find the files of one scene; `parts` are the parts of its name."""
+        folders = {role: folder / self.names[role] for role in _PICTURES if (folder / self.names[role]).is_dir()}
+        files = {role: folder / self.names[role] for role in _FILES if (folder / self.names[role]).exists()}
+        thing, _, background = parts[-1].partition("_in_")
+        captures = self.root / "data_3d" / "synthetic" / "scenes"
+        for role, path in {
+            "source_capture": captures / "objects" / thing,
+            "target_capture": captures / "backgrounds" / background,
+        }.items():
+            if background and path.is_dir():
+                files[role] = path
+        needed = ("composite", "background") if kind == "real" else ("truth",)
+        lacks = ""
+        if not any(role in folders for role in needed):
+            expected = " or ".join(f"{self.names[role]}/ ({role})" for role in needed)
+            held = ", ".join(sorted(p.name + "/" * p.is_dir() for p in folder.iterdir())) or "nothing"
+            lacks = f"{folder}: expected {expected}, found {held}; other names: --names {needed[0]}=NAME"
+        return PaperScene("_".join(parts), kind, pose, folders, files, _by_method(parts, shown), lacks)
+
+
+def _by_method(name: tuple[str, ...], shown: Mapping[tuple[str, ...], Path]) -> dict[str, Path]:
+    """Select the pictures of one scene; the part of their path that does not name the scene names the method."""
+    found: dict[str, dict[tuple[str, ...], Path]] = {}
+    for parts, path in shown.items():
+        for form in (name, ("_".join(name),)):
+            if set(form) <= set(parts):
+                rest = tuple(part for part in parts if part not in form) or ("Ours",)
+                found.setdefault(rest[0], {})[rest[1:]] = path
+                break
+    return {
+        "/".join((published_name(method), *rest)) if len(paths) > 1 else published_name(method): path
+        for method, paths in found.items()
+        for rest, path in paths.items()
+    }
+
+
+def _picture_folders(folder: Path) -> Iterator[Path]:
+    """List the folders at or below `folder` that hold pictures, in the order of their names."""
+    for path, below, files in os.walk(folder):
+        below.sort()
+        if any(Path(name).suffix.lower() in IMAGE_SUFFIXES for name in files):
+            yield Path(path)
 
 
 def pictures(folder: Path) -> dict[str, Path]:

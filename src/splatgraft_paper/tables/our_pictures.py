@@ -1,19 +1,22 @@
 """Our methods on a scene of the data set: renders of its held-out views.
 
-If both scenes are given as trained .ply files, the object has its place already. Otherwise both captures are
-reconstructed and placement.json places the object.
+1. If both scenes are given as trained .ply files, the object has its place already.
+2. Otherwise, if there is a placement.json, both captures are reconstructed and it places the object.
+3. Otherwise the authors' pasted pictures are reconstructed, and their masks cut the object out at its place. The light
+   of its own capture is unknown then, as in the first case.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
+from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.similarity import Similarity
 from splatgraft.folders.capture_files import camera_files
-from splatgraft.formats import read_cameras, read_gaussians, read_scene, write_cameras, write_gaussians
+from splatgraft.formats import read_cameras, read_gaussians, read_scene, write_cameras, write_capture, write_gaussians
 from splatgraft.project.layout import OBJECT_FILE, PLACEMENT_FILE
 from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.project.step import Context, Device, Inputs, choose_device
@@ -23,7 +26,7 @@ from splatgraft.runtime.console import Console
 from splatgraft.steps.compose import Compose
 from splatgraft_paper.benchmark.methods import Method, MethodSettings, run_method
 from splatgraft_paper.benchmark.scene import ComposedScene, GroundTruthScene, compose_scene, perform_if_stale
-from splatgraft_paper.tables.layout import PaperScene, held_out_stems
+from splatgraft_paper.tables.layout import PaperScene, held_out_stems, pictures
 
 
 @dataclass(frozen=True)
@@ -99,10 +102,52 @@ def _composed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> C
         captures = (files["source_capture"], files["target_capture"])
         truth = GroundTruthScene(scene.name, *captures, scene.folders["truth"], files["placement"])
         return compose_scene(truth, work, run.options, device=run.device, console=console)
+    if {"composite", "masks"} <= set(scene.folders) and ("background" in scene.folders or "target_capture" in files):
+        return _cut_from_pictures(scene, work, run, console)
+    found = [path.name for path in (*scene.folders.values(), *files.values())]
     raise ValueError(
-        f"{scene.name}: expected background.ply and object.ply, or both captures, gt/ and placement.json; found "
-        f"{', '.join(path.name for path in files.values()) or 'neither'}"
+        f"{scene.name}: expected background.ply and object.ply, or both captures, gt/ and placement.json, or "
+        f"composite/, masks/ and background/; found {', '.join(found) or 'none of them'}"
     )
+
+
+def _cut_from_pictures(scene: PaperScene, work: Path, run: OurRun, console: Console) -> ComposedScene:
+    """Reconstruct the pasted pictures and the background, and cut the object out by its masks, at its place."""
+    cameras = read_cameras(_cameras_path(scene))
+    given = {}
+    for role in ("composite", "background"):
+        if role in scene.folders:
+            given[role] = work / "given" / role
+            given[role].mkdir(parents=True, exist_ok=True)
+            write_capture(given[role], _pictured(scene, role, cameras))
+    placement = _placement_as_given(work)
+    target = given.get("background", scene.files.get("target_capture"))
+    assert target is not None
+    truth = GroundTruthScene(scene.name, given["composite"], target, target, placement)
+    composed = compose_scene(truth, work, run.options, device=run.device, console=console)
+    return replace(composed, from_capture=False)
+
+
+def _pictured(scene: PaperScene, role: str, cameras: Cameras) -> PosedImages:
+    """Return the pictures of a role with their cameras, and masks and no held-out view for the pasted ones."""
+    folders = {name: pictures(scene.folders[name]) for name in (role, *(("masks",) if role == "composite" else ()))}
+    stems = [Path(name).stem for name in cameras.names]
+    held = held_out_stems(stems) if role == "composite" else ()  # `compose_scene` removes those of the target
+    chosen = [stem for stem in stems if stem not in held and all(stem in found for found in folders.values())]
+    if not chosen:
+        raise ValueError(f"{scene.folders[role]}: expected pictures named like the cameras, {stems[0]}.., found none")
+    paths = {name: tuple(found[stem] for stem in chosen) for name, found in folders.items()}
+    seen = cameras[torch.tensor([stem in chosen for stem in stems])]
+    nothing = torch.zeros(0, 3)
+    return PosedImages(paths[role], seen, nothing, nothing, mask_paths=paths.get("masks", ()))
+
+
+def _placement_as_given(work: Path) -> Path:
+    """Write a placement that leaves the object where it is."""
+    path = work / "given_placement" / PLACEMENT_FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_placement(path, Placement((ObjectPlacement(Similarity.identity()),)))
+    return path
 
 
 def _placed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> ComposedScene:
@@ -110,8 +155,7 @@ def _placed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> Com
     cameras = read_cameras(_cameras_path(scene))
     composed = ComposedScene(scene.name, work, from_capture=False)
     object_file = work / "object" / OBJECT_FILE
-    placement = work / "given_placement" / PLACEMENT_FILE
-    for path in (composed.cameras, composed.target, object_file, placement):
+    for path in (composed.cameras, composed.target, object_file):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_cameras(composed.cameras, _without_held_out(cameras))
     for key, path in (("target_scene", composed.target), ("object_scene", object_file)):
@@ -119,8 +163,8 @@ def _placed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> Com
         for note in given.notes:
             console.say(f"{scene.files[key]}: {note}")
         write_gaussians(path, given.gaussians)
-    write_placement(placement, Placement((ObjectPlacement(Similarity.identity()),)))
-    perform_if_stale(Compose(composed.target, object_file, composed.composite, placement=placement), console)
+    compose = Compose(composed.target, object_file, composed.composite, placement=_placement_as_given(work))
+    perform_if_stale(compose, console)
     return composed
 
 

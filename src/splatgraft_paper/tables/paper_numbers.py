@@ -91,6 +91,17 @@ SCENES = {
     "rotation": 9,
 }
 """Number of scenes of each kind in the published data set; a rotation counts as a scene."""
+LISTED = {
+    "synthetic": (
+        "bathtub_57e_in_blend_57eadb", "bed_bg3_in_blend_adfc14", "carriage_in_blend_85a1a6",
+        "helicopter_in_blend_808c29", "sink_in_blend_92e6c7",
+    ),
+    "real": (
+        "desk_in_london_bedroom", "locomotive_in_train", "plant_in_bouquet", "sedan_in_c0e46b", "truck_in_garden",
+        "508850_in_4cea29", "d11d95_in_83d5f2",
+    ),
+}  # fmt: skip
+"""Names of scenes in the data set's card, as far as they are known: five of nine synthetic ones, all real ones."""
 
 
 def published_name(method: str) -> str:

@@ -18,7 +18,16 @@ from splatgraft.evaluation.report_page import html_page
 from splatgraft.runtime.process import source_commit
 from splatgraft_paper.benchmark.table import Table, summarize, table_section
 from splatgraft_paper.tables.layout import Kind, PaperScene, held_out_stems, match_views, pictures
-from splatgraft_paper.tables.paper_numbers import COST, DATA, ROTATION, SCENES, SYNTHETIC, UPDATES, PublishedTable
+from splatgraft_paper.tables.paper_numbers import (
+    COST,
+    DATA,
+    LISTED,
+    ROTATION,
+    SCENES,
+    SYNTHETIC,
+    UPDATES,
+    PublishedTable,
+)
 from splatgraft_paper.tables.run import METRIC_VERSIONS, PaperResults
 
 _FORMATS = {"psnr": "{:.2f}", "fid": "{:.2f}", "minutes": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}"}
@@ -39,6 +48,7 @@ def write_paper_report(out: Path, results: PaperResults) -> Path:
     tables, notes, figures = paper_tables(results), protocol_notes(results), _figures(out, results)
     shown = [f"![{path.stem}]({path.relative_to(out).as_posix()})" for path in figures]
     text = [*(table.markdown() for table in tables), *shown, "\n".join(f"- {note}" for note in notes)]
+    out.mkdir(parents=True, exist_ok=True)
     (out / "paper.md").write_text("\n\n".join(text) + "\n")
     (out / "paper.json").write_text(json.dumps(_as_json(results, notes), indent=1, allow_nan=False))
     images = "".join(
@@ -146,12 +156,17 @@ def _step_minutes(results: PaperResults, method: str, step: str) -> str:
 def protocol_notes(results: PaperResults) -> list[str]:
     """List the conditions of the measurement, one sentence each."""
     measured = results.measured
-    kinds = {kind: sum(scene.kind == kind for scene in results.scenes) for kind in SCENES}
+    kinds = {kind: sum(scene.kind == kind and not scene.lacks for scene in results.scenes) for kind in SCENES}
     found = ", ".join(f"{count} of {SCENES[kind]} {kind}" for kind, count in kinds.items())
+    named = {scene.name for scene in results.scenes}
+    absent = [name for names in LISTED.values() for name in names if name not in named]
+    others = [scene.name for scene in results.scenes if scene.kind == "real" and scene.name not in LISTED["real"]]
     resolutions = sorted({str(size) for item in measured for size in item.protocol.get("resolution", ())})  # pyright: ignore
     views = sorted({str(item.protocol["views"]) for item in measured})
     notes = [
         f"Scenes of the published data set found: {found}.",
+        *([f"Scenes that its card names and that were not found: {', '.join(absent)}."] if absent else []),
+        *([f"Real scenes that its card does not name: {', '.join(others)}."] if others else []),
         f"Views: {'; '.join(views) or 'none'} (the paper states this for the rotation experiment alone).",
         f"Resolution: {', '.join(resolutions) or 'none'}, that of the pictures, without resampling or cropping. Values "
         "are read as 8-bit sRGB in [0, 1] and not clamped further; renders of ours are clamped to [0, 1].",

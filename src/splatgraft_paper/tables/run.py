@@ -129,6 +129,8 @@ def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: C
     """Measure and run what is missing, except for the models of the data ablation."""
     found = _Found("lpips" not in not_measured, console)
     for scene in run.scenes:
+        if scene.lacks:
+            found.missing[scene.name, "ground truth"] = scene.lacks
         composite = scene.folders.get("composite")
         theirs = {**({} if composite is None else {COMPOSITE: composite}), **scene.results}
         for method, folder in theirs.items():

@@ -7,16 +7,25 @@ harmonizer.json is written by `train flux`: {"variant": "image-mask"}. The autho
 """
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
 import torch
+from safetensors import SafetensorError, safe_open
 
 from splatgraft.harmonization.flux.baked_modulation import bake
 from splatgraft.harmonization.flux.network import Autoencoder, FirstLayer, FluxNetwork, Variant, widen_layer
-from splatgraft.harmonization.flux.prompt import PROMPT_FILE, find_prompt, read_prompt
+from splatgraft.harmonization.flux.prompt import (
+    PROMPT_FILE,
+    TEXT_FOLDERS,
+    embed_empty_prompt,
+    find_prompt,
+    read_prompt,
+    write_prompt,
+)
 from splatgraft.harmonization.flux.sampling import schnell_levels
 from splatgraft.harmonization.flux.tensor_file import one_line
 from splatgraft.harmonization.interface import HarmonizerContext
@@ -43,10 +52,12 @@ def diffusers_library() -> Any:
     return diffusers
 
 
-def local_folder(weights: str, say: Say, *, parts: Sequence[str] = ("transformer",)) -> Path:
+def local_folder(
+    weights: str, say: Say, *, parts: Sequence[str] = ("transformer",), without_weights: bool = False
+) -> Path:
     """Resolve a folder, a hub id OWNER/NAME[/FOLDER] or a short name to a local folder.
 
-    Its `parts` and vae/ are fetched once.
+    Its `parts` and vae/ are fetched once; `without_weights` only the descriptions and the prompt's embeddings.
     """
     weights = hub_id(weights)
     folder = Path(weights)
@@ -61,8 +72,10 @@ def local_folder(weights: str, say: Say, *, parts: Sequence[str] = ("transformer
     repository, inner = "/".join(names[:2]), "".join(names[2:])
     if repository == _AUTHORS and not inner:
         inner = "image-mask"
-    wanted = [f"{inner}/*"] if inner else [f"{part}/*" for part in parts]
-    return hub_folder(repository, [*wanted, "vae/*", DESCRIPTION_FILE, PROMPT_FILE], say) / inner
+    wanted = [f"{inner}/*", "vae/*"] if inner else [*(f"{part}/*" for part in parts), "vae/*"]
+    if without_weights:
+        wanted = [f"{pattern[:-1]}{name}" for pattern in wanted for name in ("*.json", PROMPT_FILE)]
+    return hub_folder(repository, [*wanted, DESCRIPTION_FILE, PROMPT_FILE], say) / inner
 
 
 @dataclass(frozen=True)
@@ -84,11 +97,12 @@ class FluxFolder:
         config = read_config(transformer / "config.json", "FluxTransformer2DModel")
         if config.get("guidance_embeds"):
             raise ValueError(f"{transformer}: expected a network made of FLUX.1-schnell, found one with guidance (dev)")
+        config |= _stored_channels(transformer)
         latent = config.get("out_channels") or 64
         if config.get("in_channels", 64) not in (latent, INPUTS * latent):
             raise ValueError(
-                f"{transformer}: expected in_channels of {latent} (FLUX) or {INPUTS * latent} (a harmoniser) in "
-                f"config.json, found {config.get('in_channels')}"
+                f"{transformer}: expected in_channels of {latent} (FLUX) or {INPUTS * latent} (a harmoniser), found "
+                f"{config.get('in_channels')}"
             )
         return FluxFolder(folder, transformer, config)
 
@@ -114,6 +128,23 @@ class FluxFolder:
         if requested != "auto" and declared not in (None, requested):
             raise ValueError(f"{self.folder}: expected {requested} (--variant), found {declared}")
         return _known(declared if requested == "auto" else requested, self.folder)
+
+
+def _stored_channels(transformer: Path) -> dict[str, int]:
+    """Read the channels of the first and the last layer from the weights; empty if they cannot be read.
+
+    The config of a network whose first layer was widened may still state FLUX's own.
+    """
+    found: dict[str, int] = {}
+    for path in sorted(transformer.glob("*.safetensors")):
+        try:
+            with safe_open(path, "pt") as stored:
+                for key, name, axis in (("in_channels", "x_embedder", 1), ("out_channels", "proj_out", 0)):
+                    if f"{name}.weight" in stored.keys():  # noqa: SIM118 - it is no mapping
+                        found[key] = stored.get_slice(f"{name}.weight").get_shape()[axis]
+        except (OSError, SafetensorError):  # reported when the weights are loaded
+            return {}
+    return found
 
 
 def declared_variant(folder: Path) -> str | None:
@@ -149,8 +180,9 @@ def read_config(path: Path, kind: str) -> dict[str, Any]:
 
 
 def load_transformer(checked: FluxFolder, *, dtype: torch.dtype) -> Any:
-    """Load the transformer on the CPU."""
-    return _load(diffusers_library().FluxTransformer2DModel, checked.transformer, dtype)
+    """Load the transformer on the CPU, with the channels that its weights have."""
+    channels = {name: checked.config[name] for name in ("in_channels", "out_channels") if checked.config.get(name)}
+    return _load(diffusers_library().FluxTransformer2DModel, checked.transformer, dtype, channels)
 
 
 def load_autoencoder(folder: Path) -> Autoencoder:
@@ -158,10 +190,12 @@ def load_autoencoder(folder: Path) -> Autoencoder:
     return Autoencoder(_load(diffusers_library().AutoencoderKL, folder, torch.float32))
 
 
-def _load(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
+def _load(kind: Any, folder: Path, dtype: torch.dtype, config: Mapping[str, int] = {}) -> Any:
     variant = "bf16" if any(folder.glob("*.bf16*")) else None
     try:
-        model, about = kind.from_pretrained(folder, torch_dtype=dtype, variant=variant, output_loading_info=True)
+        model, about = kind.from_pretrained(
+            folder, torch_dtype=dtype, variant=variant, output_loading_info=True, **config
+        )
     except (OSError, ValueError, RuntimeError) as error:
         raise ValueError(f"{folder}: expected weights of {kind.__name__}, found {one_line(error)}") from error
     if missing := sorted(about["missing_keys"]):  # diffusers only warns
@@ -231,6 +265,11 @@ def load_flux(files: FluxFiles, context: HarmonizerContext, *, precision: str, s
     weights = hub_id(files.weights)
     if weights == _AUTHORS and files.variant != "auto":
         weights = f"{_AUTHORS}/{files.variant}"
+    # the prompt is small and comes first, so that nobody waits for 24 GB in vain
+    found = local_folder(weights, say, without_weights=True)
+    prompt_path = _prompt_path(
+        files.base or BASE, found, *([Path(files.base)] if files.base else []), found.parent, say=say
+    )
     folder = local_folder(weights, say)
     checked = FluxFolder.open(folder)
     if files.lora is not None and not checked.is_harmonizer:
@@ -241,7 +280,7 @@ def load_flux(files: FluxFiles, context: HarmonizerContext, *, precision: str, s
     # the authors' image-mask/ lies beside vae/
     places = [folder, *([Path(files.base)] if files.base else []), folder.parent]
     prompt = read_prompt(
-        find_prompt(files.base or BASE, *places),
+        prompt_path,
         tokens_width=checked.config.get("joint_attention_dim", 4096),
         pooled_width=checked.config.get("pooled_projection_dim", 768),
     )
@@ -271,6 +310,31 @@ def load_flux(files: FluxFiles, context: HarmonizerContext, *, precision: str, s
         transformer.to(device)
     autoencoder.network.to(device, dtype).eval().requires_grad_(False)
     return FluxNetwork(transformer, autoencoder, prompt.to(device, dtype), variant, device, dtype, starts)
+
+
+def _prompt_path(base: str, *places: Path, say: Say) -> Path:
+    """Find the empty prompt's embeddings, or make them if transformers and the base's text encoders can be had.
+
+    Raises:
+        ValueError: They are missing and cannot be made.
+    """
+    path = find_prompt(base, *places)
+    if path.is_file():
+        return path
+    found = "no transformers (pip install 'splatgraft[text]')"
+    if find_spec("transformers") is not None:
+        say(f"{base}: its text encoders (T5 and CLIP, 10 GB) embed the empty prompt once")
+        try:
+            folder = local_folder(base, say, parts=TEXT_FOLDERS)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_prompt(path, embed_empty_prompt(str(folder)), base)
+            return path
+        except ValueError as error:
+            found = str(error)
+    raise ValueError(
+        f"{path}: expected the empty prompt's embeddings, found none; `splatgraft paper train embed` makes them; here "
+        f"it failed: {found}"
+    )
 
 
 def _best_precision(checked: FluxFolder, context: HarmonizerContext) -> tuple[str, str]:
