@@ -57,7 +57,9 @@ def test_one_reconstruction_is_compared_at_every_size_that_is_asked_for(folder):
     assert (small["capture"], small["quality"], small["views"]) == ("toy", "draft", "2")
     # one reconstruction, so its cost is equal to the second
     assert all(small[name] == large[name] for name in ("seconds", "cpu_seconds", "gaussians", "peak_mb"))
-    assert small["psnr"] != large["psnr"]
+    # each size is compared by itself; one figure alone may be equal after rounding
+    figures = ("psnr", "psnr_fit", "ssim", "flip")
+    assert [small[name] for name in figures] != [large[name] for name in figures]
     assert float(large["psnr"]) > 20
     # after the fit of its own, the object exceeds its outline less
     assert float(fitted["overlap"]) > float(cut["overlap"])
