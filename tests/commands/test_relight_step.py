@@ -53,7 +53,8 @@ def relit(
     paths = {"target": "target.ply", "surroundings": "source.ply", "placement": "placement.json", "taken": "own.ply"}
     paths |= {"cameras": "target/transforms.json", "object-cameras": "source/transforms.json", "out": "relit"}
     words = [word for name, path in paths.items() for word in (f"--{name}", str(folder / path))]
-    assert main(["relight", *words, *more]) == 0
+    # the floor is split at shadows for two thirds of the time, and no test here looks at a shadow
+    assert main(["relight", *words, "--most-added", "0", *more]) == 0
     return folder / "relit"
 
 

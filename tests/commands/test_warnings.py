@@ -97,10 +97,13 @@ def test_the_report_begins_with_all_warnings_of_the_run(
     assert [line.split()[0] for line in stale] == ["evaluate"]
 
 
-def test_a_side_without_photos_is_warned_of_with_a_picture_of_the_directions(tmp_path: Path) -> None:
-    path = write_project(tmp_path)
-    shutil.rmtree(tmp_path / "photos" / "source")
-    photograph(tmp_path / "photos" / "source", plane((0.3, 0.5, 0.3)), ball(), around_deg=150.0)
+def test_a_side_without_photos_is_warned_of_with_a_picture_of_the_directions(
+    copy_project: Callable[[], Path],
+) -> None:
+    path = copy_project() / "project.toml"
+    source = path.parents[1] / "photos" / "source"
+    shutil.rmtree(source)
+    photograph(source, plane((0.3, 0.5, 0.3)), ball(), around_deg=150.0)
     assert main(["run", str(path), "--to", "compose"]) == 0
     layout = read_flow(path).layout
     for folder, said in ((layout.object, "was never photographed"), (layout.composite, "none of its photos shows")):
