@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 
@@ -78,3 +80,10 @@ class ClockSun:
         x, z = float(direction @ right), float(direction @ ahead)
         side = ("from the right" if x > 0 else "from the left") if abs(x) > abs(z) else "from ahead"
         return f"{'from behind' if z < -abs(x) else side} in the first photo"
+
+
+def clock_directions(clock: ClockSun | None) -> Float[Tensor, "c 3"]:
+    """Return the directions of the clock's candidates that are above the horizon, the most trusted first."""
+    candidates = clock.candidates if clock is not None else ()
+    shown = [one.direction for one in candidates if one.direction is not None and one.height_deg > 0]
+    return torch.tensor(shown).reshape(-1, 3)

@@ -42,7 +42,8 @@ from splatgraft.relighting.light.panorama import (
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
-from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, sun_by_clock, with_sun
+from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, with_sun
+from splatgraft.relighting.light.sun_by_clock import sun_by_clock
 from splatgraft.rendering import render
 
 # the evidence; set by hand
@@ -156,11 +157,14 @@ def estimate_light(
         around=place_surroundings(scene, cameras, place),
         up=captured.up,
     )
-    hidden = search_radiance(radiance_problem(evidence))
+    problem = radiance_problem(evidence)
+    hidden = search_radiance(problem)
     sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, place)
-    sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region) or sun_by_clock(mean, whole)
+    sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
+    if sun is None:
+        sun = sun_by_clock(captured.clock, problem, evidence, rest, main=next(iter(sources), None))
     return found if sun is None else found.with_sun(sun, scene)
 
 

@@ -176,6 +176,27 @@ class RadianceProblem:
         away = self.counted(residual) ** 2 / (s.nu * s.residual**2)
         return 0.75 * (s.nu + 1) * (weights * torch.log1p(away)).sum(0)
 
+    def refitted_cost(self, log_ratio: Float[Tensor, "m r"], *, rounds: int) -> Float[Tensor, "r"]:
+        """Compute the cost of shading and albedos for r lights of unknown level, each with its best level and albedos.
+
+        Args:
+            log_ratio: Logarithm of the colour of each receiver over the radiance that a white one would have.
+            rounds: Iterations of reweighting.
+        """
+        s, prior = self.settings, math.log(self.settings.albedo)
+        precision = self.material_weights[:, None] * s.albedo_sd**-2
+        albedos = torch.full((len(self.material_weights), log_ratio.shape[1]), prior, dtype=torch.float64)
+        level = torch.zeros(log_ratio.shape[1], dtype=torch.float64)
+        for _ in range(rounds):
+            residual = self.counted(log_ratio - level - albedos[self.evidence.material])
+            weights = self.weights[:, None] * 1.5 * (s.nu + 1) / (s.nu * s.residual**2 + residual**2)
+            level = level + (weights * residual).sum(0) / weights.sum(0).clamp_min(1e-9)
+            residual = self.counted(log_ratio - level - albedos[self.evidence.material])
+            pull = _by_material(self, weights * residual) - precision * (albedos - prior)
+            albedos = albedos + pull / (_by_material(self, weights) + precision + 1e-6)
+        away = precision * (albedos - prior) ** 2
+        return self.shading_cost(log_ratio - level - albedos[self.evidence.material]) + 0.5 * away.sum(0)
+
     def radiance_at_object(self, x: Float[Tensor, "s"]) -> Float[Tensor, "k"]:
         """Return the gray radiance from all `DIRECTIONS` at the object."""
         total = self.around.radiance.mean(1).double()

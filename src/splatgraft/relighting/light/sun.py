@@ -25,7 +25,7 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.clock_sun import ClockSun
+from splatgraft.core.clock_sun import clock_directions
 from splatgraft.core.directions import even_directions, frames_along, tangents, vogel_offsets
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import LUMINANCE, linear_from_srgb
@@ -65,20 +65,16 @@ _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chose
 _DECISIVE_BY_CLOCK = 20.0  # the same beside a clock, whose agreement counts up to 25 and leaves few wrong directions
 _TEMPERATURE = 5.0  # divisor of that log likelihood beside other evidence, because texels share their errors
 _CLOCK_IS_WRONG = 0.05  # probability that no candidate of the clock is the sun
-_MOVED_DEG = 45.0  # angle from the clock's sun within which a source is taken for the sun; its estimate is that coarse
 _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
 _MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
 _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12  # angular radii that are tried, and directions that sample each
 _UNSEEN_RADIUS_DEG = 1.0  # angular radius of a sun set by hand if no edge of a shadow shows it
-_SUN_RADIUS_DEG = 0.27
 _SOFTER = 3.0  # log likelihood over a smaller radius above which a larger one is taken, 20 to 1
 _ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for one set by hand
 _AROUND_SHADOW = 2.5  # region in which a sun set by hand is measured, in distances from a point to its shadow
 
 SET_BY_HAND = "sun set by hand"
 """Name in reports of a sun from `set_sun`."""
-BY_CLOCK = "sun by the photos' clock"
-"""Name in reports of a sun from `sun_by_clock`."""
 
 Point = tuple[float, float, float]
 """World units."""
@@ -315,7 +311,7 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
     standing, picture = standing_on(surface, captured.gaussians, region), draw_surface(captured, surface)
     if not len(standing.means) or int(picture.valid.sum()) < _MIN_TEXELS:
         return None
-    if captured.clock is not None and _towards(captured.clock) is not None:
+    if len(clock_directions(captured.clock)):
         decisive = min(decisive, _DECISIVE_BY_CLOCK)
     coarse, fine = _Comparison.of(picture, _COARSE), _Comparison.of(picture, _FINE)
     ambient, normal = surface.ambient(standing), surface.plane.normal
@@ -326,7 +322,7 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
     every = coarse.every
     visible = (surface.shadows(standing, part, every) for part in parts)
     score = torch.cat([coarse.of_suns(one, ambient[::every, ::every], _STRENGTHS) for one in visible])
-    score += _by_clock(directions, captured.clock)
+    score += _by_clock(directions, captured)
     best, evidence = directions[0], -math.inf
     for _ in range(4):  # maxima that are refined
         if float(score.max()) < _PROMISING:
@@ -338,7 +334,7 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
             near = near[near @ normal > _LOWEST]
             shadows = _blurred(surface.shadows(standing, near))
             found = fine.of_suns(shadows, blurred_ambient[0], _FINE_STRENGTHS) - without
-            found += _by_clock(near, captured.clock)
+            found += _by_clock(near, captured)
             mode = near[found.argmax()]
             if float(found.max()) > evidence:
                 best, evidence = mode, float(found.max())
@@ -350,43 +346,15 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
     return Sun(best, radius, normal, ratio, evidence)
 
 
-def _towards(clock: ClockSun) -> Float[Tensor, "c 3"] | None:
-    """Return the directions of the clock's candidates above the horizon; None if there are none."""
-    shown = [one.direction for one in clock.candidates if one.direction is not None and one.height_deg > 0]
-    return torch.tensor(shown) if shown else None
-
-
-def _by_clock(directions: Float[Tensor, "k 3"], clock: ClockSun | None) -> Float[Tensor, "k"]:
+def _by_clock(directions: Float[Tensor, "k 3"], captured: CapturedScene) -> Float[Tensor, "k"]:
     """Compute the log density of directions by the clock over that of an even hemisphere, times `_TEMPERATURE`."""
-    towards = None if clock is None else _towards(clock)
-    if clock is None or towards is None:
+    towards = clock_directions(captured.clock)
+    if captured.clock is None or not len(towards):
         return torch.zeros(len(directions))
-    error = math.radians(max(clock.error_deg, _ERROR_DEG))
+    error = math.radians(max(captured.clock.error_deg, _ERROR_DEG))
     away = (directions @ towards.T).clamp(-1, 1).acos() / error
     density = torch.exp(-0.5 * away.square()).mean(1) / error**2
     return _TEMPERATURE * ((1 - _CLOCK_IS_WRONG) * density + _CLOCK_IS_WRONG).log()
-
-
-def sun_by_clock(light: Light, captured: CapturedScene) -> Sun | None:
-    """Move the distant source of a light that may be the sun to the sun's direction by the clock.
-
-    Args:
-        light: The estimated light, in which no shadow shows the sun.
-        captured: The scene.
-
-    Returns:
-        The sun, whose strength is that of the distant sources; None if the clock gives no direction, or if no distant
-        source lies near it, as under clouds or indoors.
-    """
-    towards = None if captured.clock is None else _towards(captured.clock)
-    if captured.clock is None or towards is None:
-        return None
-    for source in light.sources:
-        away = towards @ torch.tensor(source.direction)
-        if math.isinf(source.distance) and float(away.max()) > math.cos(math.radians(_MOVED_DEG)):
-            direction, error = towards[away.argmax()], max(captured.clock.error_deg, _ERROR_DEG)
-            return Sun(direction, _SUN_RADIUS_DEG, captured.up, None, 0.0, error, BY_CLOCK)
-    return None
 
 
 def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:

@@ -1,0 +1,118 @@
+"""The sun at the direction that the clock of the photos gives, where no shadow shows it.
+
+The clock knows where the sun stands, not whether clouds or walls hide it. So the sun's strength, its irradiance on
+level ground over that of all other light, has a posterior:
+
+- The likelihood is that of the shading and the highlights (`radiance_model.py`), for one source over the light that the
+  estimate has beside its sources.
+- The prior is a mixture. Under a clear sky the strength is known from the sun's height; otherwise every strength up to
+  that is as likely, on a logarithmic scale.
+"""
+
+import math
+
+import torch
+from jaxtyping import Float
+
+from splatgraft.core.clock_sun import ClockSun, clock_directions
+from splatgraft.relighting.light.light import LightSource
+from splatgraft.relighting.light.panorama import DIRECTIONS
+from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceProblem
+from splatgraft.relighting.light.sun import Sun
+
+# a clear sky, fitted by benchmarks/fit_sky.py
+_CLEAR = 11.2  # strength of the sun over the sine of its height
+_CLEAR_SD = 0.26  # standard deviation of the logarithm of that
+_TINT = (1.34, 0.97, 0.58)  # strength in red, green and blue over that in luminance
+
+# set by hand; no result is sensitive to these numbers
+_IS_CLEAR = 0.5  # prior probability of a clear sky
+_STRENGTHS = torch.logspace(-2, 1.4, 35, dtype=torch.float64)
+_LEAST = 0.1  # strength below which the sun is hidden
+_LOWEST = 0.02  # bound on the sine of the sun's height, by which is divided
+_SUN_RADIUS_DEG = 0.27
+_NEAR = 2.5  # standard errors between the clock's sun and an estimated source that may be the same
+_MIN_ERROR_DEG = 1.0
+_ROUNDS = 8  # iterations of reweighting
+
+BY_CLOCK = "sun by the photos' clock"
+"""Name in reports."""
+
+
+def sun_by_clock(
+    clock: ClockSun | None,
+    problem: RadianceProblem,
+    evidence: LightEvidence,
+    rest: Float[torch.Tensor, "k 3"],
+    *,
+    main: LightSource | None,
+) -> Sun | None:
+    """Estimate the sun near the direction of the clock's most trusted candidate.
+
+    Args:
+        clock: The sun by the clock of the photos.
+        problem: Density of the light at the place.
+        evidence: Evidence that `problem` is made of.
+        rest: Estimated radiance from all `DIRECTIONS` without the sources.
+        main: Brightest estimated source. If it may be the sun, its direction is averaged with the clock's.
+
+    Returns:
+        The sun; None without a direction, or if the evidence is against a sun there.
+    """
+    directions = clock_directions(clock)
+    if clock is None or not len(directions):
+        return None
+    direction, error_deg = _joined(directions[0], clock.error_deg, main)
+    log_posterior = _log_prior(float(direction @ evidence.up))
+    log_posterior -= _costs(problem, evidence, rest, direction) / problem.settings.temperature
+    strength = float(_STRENGTHS[log_posterior.argmax()])
+    if strength < _LEAST:
+        return None
+    ratio = strength * torch.tensor(_TINT)
+    return Sun(direction, _SUN_RADIUS_DEG, evidence.up, ratio, evidence=0.0, error_deg=error_deg, name=BY_CLOCK)
+
+
+def _joined(
+    direction: Float[torch.Tensor, "3"], error_deg: float, main: LightSource | None
+) -> tuple[Float[torch.Tensor, "3"], float]:
+    """Average a direction with that of a distant source within `_NEAR` standard errors, weighted by precision."""
+    if main is None or math.isfinite(main.distance):
+        return direction, error_deg
+    other = torch.tensor(main.direction)
+    apart_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(direction @ other)))))
+    if apart_deg > _NEAR * math.hypot(error_deg, main.uncertainty_deg):
+        return direction, error_deg
+    precisions = 1 / max(error_deg, _MIN_ERROR_DEG) ** 2, 1 / max(main.uncertainty_deg, _MIN_ERROR_DEG) ** 2
+    mean = torch.nn.functional.normalize(precisions[0] * direction + precisions[1] * other, dim=0)
+    return mean, sum(precisions) ** -0.5
+
+
+def _log_prior(sine: float) -> Float[torch.Tensor, "r"]:
+    """Return the log prior of `_STRENGTHS` for a sun whose height has this sine."""
+    clear = _CLEAR * max(sine, _LOWEST)
+    is_clear = torch.exp(-0.5 * ((_STRENGTHS / clear).log() / _CLEAR_SD) ** 2)
+    is_weaker = (clear >= _STRENGTHS).double()
+    return (_IS_CLEAR * is_clear / is_clear.sum() + (1 - _IS_CLEAR) * is_weaker / is_weaker.sum() + 1e-12).log()
+
+
+def _costs(
+    problem: RadianceProblem,
+    evidence: LightEvidence,
+    rest: Float[torch.Tensor, "k 3"],
+    direction: Float[torch.Tensor, "3"],
+) -> Float[torch.Tensor, "r"]:
+    """Compute the negative log likelihood of each of `_STRENGTHS`, but for a constant."""
+    gray, sines = rest.mean(1).double(), (DIRECTIONS @ evidence.up).clamp_min(0).double()
+    at = int((DIRECTIONS @ direction).argmax())
+    # radiance of the direction that gives the sun's irradiance on level ground
+    added = _STRENGTHS * (sines @ gray) / sines[at].clamp_min(_LOWEST)
+    surfaces = evidence.surfaces
+    transport, of_sun = surfaces.transport(evidence.far.distance).double(), surfaces.transport()[:, at].double()
+    mean_color = (surfaces.weights[:, None] * surfaces.colors).sum(0).mean()
+    white = transport @ gray + (1 - transport.sum(1)).clamp_min(0) * mean_color
+    received = (white[:, None] + of_sun[:, None] * added).clamp_min(1e-5)
+    costs = problem.refitted_cost(problem.log_color[:, None] - received.log(), rounds=_ROUNDS)
+    if problem.highlights is not None:
+        explained = problem.highlights.explained_with_more(gray, torch.full((len(added),), at), added)
+        costs = costs + problem.settings.highlights * torch.log1p(-explained).double()
+    return costs
