@@ -163,6 +163,10 @@ def estimate_light(
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, place)
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
+    if sun is None and captured.clock is not None:
+        # things far from a small object, such as trees around a lawn, cast shadows, too
+        distance = float((cameras.centers - place.center).norm(dim=1).median())
+        sun = find_sun(whole, BoundingSphere(place.center, distance)) if distance > region.radius else None
     if sun is None:
         sun = sun_by_clock(captured.clock, problem, evidence, rest, main=next(iter(sources), None))
     return found if sun is None else found.with_sun(sun, scene)
