@@ -164,7 +164,7 @@ def with_object(background: Picture, object_: Gaussians, camera: Cameras) -> UIn
     alpha = found.alpha[0].numpy()
     if background.depth is not None:
         # the mean of inverse depth: faint pixels of the outline have no median depth
-        is_nearer = found.inverse_depth[0, ..., 0].numpy() > alpha / background.depth
+        is_nearer = found.inverse_depth[0].numpy() > alpha / background.depth
         alpha = np.where(is_nearer, alpha, 0)
     color = found.color[0].clamp(0, 1).numpy()
     share = np.where(alpha > 0, 1 - alpha, 1)[..., None]
