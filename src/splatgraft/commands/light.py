@@ -10,7 +10,6 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_radiance
 from splatgraft.core.rotations import rotation_between
@@ -79,14 +78,15 @@ class LightAt:
             raise ValueError(f"--radius: expected a number above 0, found {self.radius:g}")
         step = self._step()
         scene, spheres = _scene_of(step)
-        cameras = read_cameras(step.cameras)
+        cameras, clock = read_cameras(step.cameras), read_clock_sun(step.cameras)
+        captured = CapturedScene(scene, cameras, clock)
         place = self._place(step, spheres, cameras)
-        up = estimate_up(cameras)
+        up = captured.up
         turn = None if self.frame == "capture" else _BLENDER_FROM_DOWN_Y @ rotation_between(up, -torch.eye(3)[1])
         directions = equirectangular_directions(self.height)
         directions = directions if turn is None else directions @ turn
         with console.bar("light"):
-            light, radiance = _light_at(step, scene, cameras, place, directions)
+            light, radiance = _light_at(step, captured, place, directions)
         write_radiance(self.out, radiance)
         lamps = self.out.with_suffix(".json")
         with atomic_write(lamps) as stream:
@@ -94,9 +94,8 @@ class LightAt:
         console.say(
             f"The light at {', '.join(f'{v:.3g}' for v in place.center.tolist())}: {describe_light(light, up)}."
         )
-        sun = read_clock_sun(step.cameras)
-        if sun is not None:
-            console.say(f"By the clock of the target's photos: {sun.describe(cameras)}.")
+        if clock is not None:
+            console.say(f"By the clock of the target's photos: {clock.describe(cameras)}.")
         console.result(self.out)
         console.result(lamps)
         return 0
@@ -142,7 +141,7 @@ def _scene_of(step: Relight) -> tuple[Gaussians, list[BoundingSphere]]:
 
 
 def _light_at(
-    step: Relight, scene: Gaussians, cameras: Cameras, place: BoundingSphere, directions: Float[Tensor, "h w 3"]
+    step: Relight, captured: CapturedScene, place: BoundingSphere, directions: Float[Tensor, "h w 3"]
 ) -> tuple[Light, Float[Tensor, "h w 3"]]:
     """Return the light that `relight` would use, and the radiance from `directions` without the light's sources.
 
@@ -151,7 +150,6 @@ def _light_at(
     given = step.given()
     if given is not None:
         return given, given.ambient_radiance(directions.reshape(-1, 3)).reshape(directions.shape)
-    captured = CapturedScene(scene, cameras, read_clock_sun(step.cameras) if step.cameras else None)
     found = estimate_light(captured, place, sun_through=step.options.sun_through)
     if isinstance(found, NoLight):
         raise ValueError(f"--at: expected a place with light around it, found none. {found.reason}")

@@ -32,9 +32,7 @@ _MAX_USED = 2000  # Gaussians of target and of object in the fit, spread evenly 
 _MIN_FACING = math.sqrt(0.75)  # cosine between a Gaussian's normal and the plane's: 30 degrees
 _DEEPEST = 3.0  # standard deviations from the layer's middle to its end; an object with a higher base floats
 _LEVEL = 0.5  # standard deviations by which the mean height beside a Gaussian may be off; one more: not flattened
-_SLOPE = (
-    0.2  # tangent; a flattened layer rises from the foot by 11 degrees, and lower cameras may see it cover the foot
-)
+_SLOPE = 0.2  # tangent, 11 degrees, by which a flattened layer rises from the foot; lower cameras may see it in front
 _FLATTEST = 0.2  # smallest factor on heights; measured: a flatter layer covers no less
 
 

@@ -60,7 +60,7 @@ class ClockSun:
     up: tuple[float, float, float]
     """Unit up direction by which the heights count, world frame."""
     error_deg: float
-    """Standard error of the directions, degrees; if there are none, of the heights."""
+    """Standard error of the directions, degrees, or of the heights if no azimuth is known."""
     source: str
     """Evidence for the world's orientation, for messages."""
     metres_per_unit: float | None = None

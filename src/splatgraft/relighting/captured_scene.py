@@ -32,7 +32,7 @@ class CapturedScene:
 
     @cached_property
     def up(self) -> Float[Tensor, "3"]:
-        """Unit up direction, by the photos' positions if these are known, otherwise estimated from the cameras."""
+        """Unit up direction, of `clock` if there is one, otherwise estimated from the cameras."""
         return estimate_up(self.cameras) if self.clock is None else torch.tensor(self.clock.up)
 
     @cached_property

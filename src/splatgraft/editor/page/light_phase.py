@@ -353,7 +353,8 @@ class SunClicks:
             return
         self._points, light = points[:-2], self._light_of(session)
         assert light is not None
-        sun = set_sun(points, CapturedScene(scene, session.scenes.cameras(files.target_cameras)))
+        cameras, clock = session.scenes.cameras(files.target_cameras), session.scenes.target_clock()
+        sun = set_sun(points, CapturedScene(scene, cameras, clock))
         session.change(replace(state, light=with_sun(light, sun)))
         self._points, self._set_light = points, session.state.light
         pairs = len(points) // 2

@@ -43,7 +43,7 @@ from splatgraft.relighting.light.panorama import (
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
 from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, with_sun
-from splatgraft.relighting.light.sun_by_clock import sun_by_clock
+from splatgraft.relighting.light.sun_by_clock import find_sun_by_clock
 from splatgraft.rendering import render
 
 # the evidence; set by hand
@@ -165,17 +165,21 @@ def estimate_light(
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
     if sun is None and captured.clock is not None:
         # things far from a small object, such as trees around a lawn, cast shadows, too
-        distance = float((cameras.centers - place.center).norm(dim=1).median())
+        distance = _camera_distance(place, cameras)
         sun = find_sun(whole, BoundingSphere(place.center, distance)) if distance > region.radius else None
     if sun is None:
-        sun = sun_by_clock(captured.clock, problem, evidence, rest, main=next(iter(sources), None))
+        sun = find_sun_by_clock(captured.clock, problem, evidence, rest, main=next(iter(sources), None))
     return found if sun is None else found.with_sun(sun, scene)
 
 
 def region_around(place: BoundingSphere, cameras: Cameras) -> BoundingSphere:
     """Return the region of evidence for the light at a place: the cameras' median distance, within bounds."""
-    distance = float((cameras.centers - place.center).norm(dim=1).median())
-    return BoundingSphere(place.center, max(_MIN_RADII * place.radius, min(distance, _MAX_RADII * place.radius)))
+    distance = min(_camera_distance(place, cameras), _MAX_RADII * place.radius)
+    return BoundingSphere(place.center, max(_MIN_RADII * place.radius, distance))
+
+
+def _camera_distance(place: BoundingSphere, cameras: Cameras) -> float:
+    return float((cameras.centers - place.center).norm(dim=1).median())
 
 
 def _seen_shares(evidence: LightEvidence) -> dict[str, float]:

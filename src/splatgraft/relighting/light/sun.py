@@ -8,7 +8,8 @@
 3. Compare differences of log luminance between texels a few texels apart in the picture with the differences that sun
    and other light predict. The density of a difference is a Cauchy density, because texels also differ by material. It
    is mixed with the chance that something unseen shades a texel, or a whole tile of the picture.
-4. Add the log density of the sun's direction by the clock of the photos, if it is known.
+4. Add the log density of the direction by the clock of the photos, if there is one. It chooses between directions; the
+   shadows alone decide whether there is a sun.
 5. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
 
 `set_sun` takes the direction from points that a user marks together with their shadows.
@@ -62,8 +63,8 @@ _APART = math.cos(math.radians(8.0))  # cosine of the minimum angle between two 
 _SPANS = ((3.0, 1.0), (1.0, 0.33))  # half width and step of the grids around a maximum, degrees
 _PROMISING = 10.0  # log likelihood over that of even light above which a direction of the search is refined
 _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
-_DECISIVE_BY_CLOCK = 20.0  # the same beside a clock, whose agreement counts up to 25 and leaves few wrong directions
-_TEMPERATURE = 5.0  # divisor of that log likelihood beside other evidence, because texels share their errors
+_DECISIVE_BY_CLOCK = 20.0  # the same beside a clock, which leaves few wrong directions
+_TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a clock's density, because texels share their errors
 _CLOCK_IS_WRONG = 0.05  # probability that no candidate of the clock is the sun
 _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
 _MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
@@ -323,7 +324,7 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
     visible = (surface.shadows(standing, part, every) for part in parts)
     score = torch.cat([coarse.of_suns(one, ambient[::every, ::every], _STRENGTHS) for one in visible])
     score += _by_clock(directions, captured)
-    best, evidence = directions[0], -math.inf
+    best, likeliest, evidence = directions[0], -math.inf, -math.inf
     for _ in range(4):  # maxima that are refined
         if float(score.max()) < _PROMISING:
             break
@@ -334,10 +335,11 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
             near = near[near @ normal > _LOWEST]
             shadows = _blurred(surface.shadows(standing, near))
             found = fine.of_suns(shadows, blurred_ambient[0], _FINE_STRENGTHS) - without
-            found += _by_clock(near, captured)
-            mode = near[found.argmax()]
-            if float(found.max()) > evidence:
-                best, evidence = mode, float(found.max())
+            with_clock = found + _by_clock(near, captured)
+            i = int(with_clock.argmax())
+            mode = near[i]
+            if float(with_clock[i]) > likeliest:
+                best, likeliest, evidence = mode, float(with_clock[i]), float(found[i])
     if evidence < decisive:
         return None
     radius, ratio = _radius_and_ratio(picture, standing, ambient, best)

@@ -13,6 +13,7 @@ import math
 
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from splatgraft.core.clock_sun import ClockSun, clock_directions
 from splatgraft.relighting.light.light import LightSource
@@ -25,7 +26,7 @@ _CLEAR = 11.2  # strength of the sun over the sine of its height
 _CLEAR_SD = 0.26  # standard deviation of the logarithm of that
 _TINT = (1.34, 0.97, 0.58)  # strength in red, green and blue over that in luminance
 
-# set by hand; no result is sensitive to these numbers
+# set by hand
 _IS_CLEAR = 0.5  # prior probability of a clear sky
 _STRENGTHS = torch.logspace(-2, 1.4, 35, dtype=torch.float64)
 _LEAST = 0.1  # strength below which the sun is hidden
@@ -39,11 +40,11 @@ BY_CLOCK = "sun by the photos' clock"
 """Name in reports."""
 
 
-def sun_by_clock(
+def find_sun_by_clock(
     clock: ClockSun | None,
     problem: RadianceProblem,
     evidence: LightEvidence,
-    rest: Float[torch.Tensor, "k 3"],
+    rest: Float[Tensor, "k 3"],
     *,
     main: LightSource | None,
 ) -> Sun | None:
@@ -73,8 +74,8 @@ def sun_by_clock(
 
 
 def _joined(
-    direction: Float[torch.Tensor, "3"], error_deg: float, main: LightSource | None
-) -> tuple[Float[torch.Tensor, "3"], float]:
+    direction: Float[Tensor, "3"], error_deg: float, main: LightSource | None
+) -> tuple[Float[Tensor, "3"], float]:
     """Average a direction with that of a distant source within `_NEAR` standard errors, weighted by precision."""
     if main is None or math.isfinite(main.distance):
         return direction, error_deg
@@ -87,7 +88,7 @@ def _joined(
     return mean, sum(precisions) ** -0.5
 
 
-def _log_prior(sine: float) -> Float[torch.Tensor, "r"]:
+def _log_prior(sine: float) -> Float[Tensor, "r"]:
     """Return the log prior of `_STRENGTHS` for a sun whose height has this sine."""
     clear = _CLEAR * max(sine, _LOWEST)
     is_clear = torch.exp(-0.5 * ((_STRENGTHS / clear).log() / _CLEAR_SD) ** 2)
@@ -98,9 +99,9 @@ def _log_prior(sine: float) -> Float[torch.Tensor, "r"]:
 def _costs(
     problem: RadianceProblem,
     evidence: LightEvidence,
-    rest: Float[torch.Tensor, "k 3"],
-    direction: Float[torch.Tensor, "3"],
-) -> Float[torch.Tensor, "r"]:
+    rest: Float[Tensor, "k 3"],
+    direction: Float[Tensor, "3"],
+) -> Float[Tensor, "r"]:
     """Compute the negative log likelihood of each of `_STRENGTHS`, but for a constant."""
     gray, sines = rest.mean(1).double(), (DIRECTIONS @ evidence.up).clamp_min(0).double()
     at = int((DIRECTIONS @ direction).argmax())
