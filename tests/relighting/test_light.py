@@ -16,7 +16,7 @@ from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.capture_orientation import estimate_up, focus_point
 from splatgraft.core.clock_sun import ClockSun, SunCandidate
-from splatgraft.core.directions import even_directions, fit_sh
+from splatgraft.core.directions import even_directions, fit_sh, tangents
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
 from splatgraft.core.similarity import Similarity
@@ -36,7 +36,7 @@ from splatgraft.relighting.light.panorama import (
     render_panorama,
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
-from splatgraft.relighting.light.sun import SET_BY_HAND, find_sun, set_sun, with_sun
+from splatgraft.relighting.light.sun import SET_BY_HAND, direction_through, find_sun, set_sun, with_sun
 from splatgraft.relighting.light.sun_by_clock import BY_CLOCK, find_sun_by_clock
 
 
@@ -353,7 +353,34 @@ def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s
         set_sun(points[:3], CapturedScene(scene, views()))
     # far from all surfaces there is no edge: the points give only the direction
     away = [(20.0 + x, y, z) for x, y, z in points]
-    assert set_sun(away, CapturedScene(scene, views())).ratio is None
+    unseen = set_sun(away, CapturedScene(scene, views()))
+    assert unseen.ratio is None
+    assert degrees_apart(unseen.direction, direction_through(points, UP)[0]) < 0.1
+    # a lamp beside it, which is as uncertain, gives way with its strength: 3 of 4 parts of the light on the floor
+    lamp = LightSource((0.0, 0.0, 1.0), (9.42, 9.42, 9.42), distance=5.0)
+    given_way = with_sun(Light((lamp,), fit_ambient(torch.ones(3))), unseen)
+    assert len(given_way.sources) == 1
+    on_floor = given_way.irradiance(UP[None])[0]
+    assert on_floor.tolist() == pytest.approx([4 * math.pi] * 3, rel=0.02)
+    by_sun = torch.tensor(given_way.sources[0].irradiance) * given_way.sources[0].direction[2]
+    assert (by_sun / on_floor).tolist() == pytest.approx([0.75] * 3, rel=0.02)
+
+
+# 15 degrees are the standard error that clicks are taken to have
+@pytest.mark.parametrize("off_deg", [5.0, 10.0, 15.0])
+@pytest.mark.parametrize("around", [0, 3, pytest.param(slice(None), marks=pytest.mark.long)])
+def test_points_that_are_degrees_off_give_the_sun_of_the_shadow_beside_them(off_deg, around):
+    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+    captured, top = CapturedScene(sunlit_scene(sun, 3.0), views()), torch.tensor([1.0, 0.2, 0.5])
+    shadow = top - sun * top[2] / sun[2]
+    right, down = tangents(sun)
+    for angle in torch.arange(8)[around].reshape(-1) * (math.pi / 4):
+        away = math.tan(math.radians(off_deg)) * (angle.cos() * right + angle.sin() * down)
+        caster = shadow + torch.nn.functional.normalize(sun + away, dim=0) * (top - shadow).norm()
+        found = set_sun([(*caster.tolist(),), (*shadow.tolist(),)], captured)
+        assert degrees_apart(found.direction, sun) < 3
+        assert found.ratio is not None
+        assert found.ratio.tolist() == pytest.approx([3 * float(sun[2])] * 3, rel=0.25)
 
 
 def clock_at(*directions, error_deg=5.0):

@@ -25,7 +25,7 @@ from splatgraft.editor.session import Session
 from splatgraft.editor.sky_dome import SkyDome
 from splatgraft.relighting import LayerWeights, Light, LightSource
 from splatgraft.relighting.captured_scene import CapturedScene
-from splatgraft.relighting.light.sun import Point, set_sun, with_sun
+from splatgraft.relighting.light.sun import Point, direction_through, set_sun, with_sun
 
 _FIRST = (
     ("exposure", "Brightness", (-2.0, 2.0), "Of the object, in stops; 0 is as computed"),
@@ -354,15 +354,20 @@ class SunClicks:
         self._points, light = points[:-2], self._light_of(session)
         assert light is not None
         cameras, clock = session.scenes.cameras(files.target_cameras), session.scenes.target_clock()
-        sun = set_sun(points, CapturedScene(scene, cameras, clock))
+        captured = CapturedScene(scene, cameras, clock)
+        sun = set_sun(points, captured)
         session.change(replace(state, light=with_sun(light, sun)))
         self._points, self._set_light = points, session.state.light
-        pairs = len(points) // 2
-        agree = f"{pairs} pairs, which agree to {sun.error_deg:.0f}°" if pairs > 1 else "one pair of points"
-        strength = (
-            "as the shadow's edge shows" if sun.ratio is not None else "estimated, as no edge of the shadow is seen"
-        )
-        self._context.say(f"the sun by {agree}; its strength is {strength}; another pair makes it more exact")
+        pairs = "one pair of points" if len(points) == 2 else f"{len(points) // 2} pairs of points"
+        if sun.ratio is None:
+            self._context.say(
+                f"the sun by {pairs}; no edge of a shadow is seen there, so its strength is estimated; "
+                "click another pair beside a clear shadow"
+            )
+            return
+        moved_deg = math.degrees(math.acos(min(1.0, float(sun.direction @ direction_through(points, captured.up)[0]))))
+        moved = f", moved {moved_deg:.0f}° to fit the shadows there" if moved_deg > 1 else ""
+        self._context.say(f"the sun by {pairs}{moved}; its strength is as the shadow's edge shows")
 
 
 def arrow_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "2 3"]:

@@ -163,10 +163,6 @@ def estimate_light(
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, place)
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
-    if sun is None and captured.clock is not None:
-        # things far from a small object, such as trees around a lawn, cast shadows, too
-        distance = _camera_distance(place, cameras)
-        sun = find_sun(whole, BoundingSphere(place.center, distance)) if distance > region.radius else None
     if sun is None:
         sun = find_sun_by_clock(captured.clock, problem, evidence, rest, main=next(iter(sources), None))
     return found if sun is None else found.with_sun(sun, scene)
@@ -174,12 +170,8 @@ def estimate_light(
 
 def region_around(place: BoundingSphere, cameras: Cameras) -> BoundingSphere:
     """Return the region of evidence for the light at a place: the cameras' median distance, within bounds."""
-    distance = min(_camera_distance(place, cameras), _MAX_RADII * place.radius)
-    return BoundingSphere(place.center, max(_MIN_RADII * place.radius, distance))
-
-
-def _camera_distance(place: BoundingSphere, cameras: Cameras) -> float:
-    return float((cameras.centers - place.center).norm(dim=1).median())
+    distance = float((cameras.centers - place.center).norm(dim=1).median())
+    return BoundingSphere(place.center, max(_MIN_RADII * place.radius, min(distance, _MAX_RADII * place.radius)))
 
 
 def _seen_shares(evidence: LightEvidence) -> dict[str, float]:

@@ -12,11 +12,11 @@
    shadows alone decide whether there is a sun.
 5. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
 
-`set_sun` takes the direction from points that a user marks together with their shadows.
+`set_sun` searches in the same way near the direction of points that a user marks together with their shadows.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -26,7 +26,7 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.clock_sun import clock_directions
+from splatgraft.core.clock_sun import ClockSun, clock_directions
 from splatgraft.core.directions import even_directions, frames_along, tangents, vogel_offsets
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import LUMINANCE, linear_from_srgb
@@ -63,15 +63,15 @@ _APART = math.cos(math.radians(8.0))  # cosine of the minimum angle between two 
 _SPANS = ((3.0, 1.0), (1.0, 0.33))  # half width and step of the grids around a maximum, degrees
 _PROMISING = 10.0  # log likelihood over that of even light above which a direction of the search is refined
 _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
-_DECISIVE_BY_CLOCK = 20.0  # the same beside a clock, which leaves few wrong directions
-_TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a clock's density, because texels share their errors
+_TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a prior, because texels share their errors
 _CLOCK_IS_WRONG = 0.05  # probability that no candidate of the clock is the sun
 _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
 _MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
 _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12  # angular radii that are tried, and directions that sample each
 _UNSEEN_RADIUS_DEG = 1.0  # angular radius of a sun set by hand if no edge of a shadow shows it
 _SOFTER = 3.0  # log likelihood over a smaller radius above which a larger one is taken, 20 to 1
-_ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for one set by hand
+_ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for others
+_BY_HAND_DEG, _BY_HAND_SPAN = 15.0, (30.0, 3.0)  # standard error of points set by hand; search around their direction
 _AROUND_SHADOW = 2.5  # region in which a sun set by hand is measured, in distances from a point to its shadow
 
 SET_BY_HAND = "sun set by hand"
@@ -79,6 +79,9 @@ SET_BY_HAND = "sun set by hand"
 
 Point = tuple[float, float, float]
 """World units."""
+
+LogPrior = Callable[[Float[Tensor, "k 3"]], Float[Tensor, "k"]]
+"""Log density of k unit directions of the sun."""
 
 
 @dataclass(frozen=True)
@@ -295,6 +298,69 @@ class _Comparison:
         return torch.stack([self.log_likelihoods(ambient + s * visible) for s in strengths]).amax(0)
 
 
+@dataclass(frozen=True)
+class _ShadowEvidence:
+    """Shadows that a surface shows, and the occluders that may cast them."""
+
+    picture: SurfacePicture
+    standing: Occluders
+    """Gaussians above the surface."""
+    ambient: Float[Tensor, "s s"]
+    """Share of all other light that reaches the texels."""
+
+    @staticmethod
+    def of(captured: CapturedScene, region: BoundingSphere) -> "_ShadowEvidence | None":
+        """Collect the evidence in a region; None if it has no level surface, too few texels, or no occluders."""
+        surface = find_surface(captured, region)
+        if surface is None:
+            return None
+        standing, picture = standing_on(surface, captured.gaussians, region), draw_surface(captured, surface)
+        if not len(standing.means) or int(picture.valid.sum()) < _MIN_TEXELS:
+            return None
+        return _ShadowEvidence(picture, standing, surface.ambient(standing))
+
+    @property
+    def surface(self) -> Surface:
+        return self.picture.surface
+
+    def above(self, directions: Float[Tensor, "k 3"]) -> Float[Tensor, "m 3"]:
+        """Select the directions above the surface."""
+        return directions[directions @ self.surface.plane.normal > _LOWEST]
+
+    def best(self, directions: Float[Tensor, "k 3"], log_prior: LogPrior) -> tuple[Float[Tensor, "3"], float]:
+        """Find the sun's most probable direction.
+
+        Args:
+            directions: Unit directions above the surface, among which the maxima are searched.
+            log_prior: Log density of directions.
+
+        Returns:
+            The direction, and the log likelihood of its shadows over that of no sun; -inf if no direction is promising.
+        """
+        coarse, fine = _Comparison.of(self.picture, _COARSE), _Comparison.of(self.picture, _FINE)
+        every, surface = coarse.every, self.surface
+        ambient, blurred_ambient = self.ambient[::every, ::every], _blurred(self.ambient[None])
+        without = max(0.0, float(fine.log_likelihoods(blurred_ambient)))
+        visible = (surface.shadows(self.standing, part, every) for part in directions.split(64))  # bounds memory
+        score = torch.cat([coarse.of_suns(one, ambient, _STRENGTHS) for one in visible]) + log_prior(directions)
+        best, likeliest, evidence = directions[0], -math.inf, -math.inf
+        for _ in range(4):  # maxima that are refined
+            if float(score.max()) < _PROMISING:
+                break
+            mode = directions[score.argmax()]
+            score = torch.where(directions @ mode > _APART, -math.inf, score)
+            for span, step in _SPANS:
+                near = self.above(_around(mode, span, step))
+                shadows = _blurred(surface.shadows(self.standing, near))
+                found = fine.of_suns(shadows, blurred_ambient[0], _FINE_STRENGTHS) - without
+                posterior = found + log_prior(near)
+                i = int(posterior.argmax())
+                mode = near[i]
+                if float(posterior[i]) > likeliest:
+                    best, likeliest, evidence = mode, float(posterior[i]), float(found[i])
+        return best, evidence
+
+
 def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float = _DECISIVE) -> Sun | None:
     """Find the sun whose shadows a level surface shows.
 
@@ -306,64 +372,50 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
     Returns:
         The sun; None if no direction is decisively better than no sun.
     """
-    surface = find_surface(captured, region)
-    if surface is None:
+    shown = _ShadowEvidence.of(captured, region)
+    if shown is None:
         return None
-    standing, picture = standing_on(surface, captured.gaussians, region), draw_surface(captured, surface)
-    if not len(standing.means) or int(picture.valid.sum()) < _MIN_TEXELS:
-        return None
-    if len(clock_directions(captured.clock)):
-        decisive = min(decisive, _DECISIVE_BY_CLOCK)
-    coarse, fine = _Comparison.of(picture, _COARSE), _Comparison.of(picture, _FINE)
-    ambient, normal = surface.ambient(standing), surface.plane.normal
-    blurred_ambient = _blurred(ambient[None])
-    without = max(0.0, float(fine.log_likelihoods(blurred_ambient)))
-    directions = _DIRECTIONS[_DIRECTIONS @ normal > _LOWEST]
-    parts = directions.split(64)  # bounds memory
-    every = coarse.every
-    visible = (surface.shadows(standing, part, every) for part in parts)
-    score = torch.cat([coarse.of_suns(one, ambient[::every, ::every], _STRENGTHS) for one in visible])
-    score += _by_clock(directions, captured)
-    best, likeliest, evidence = directions[0], -math.inf, -math.inf
-    for _ in range(4):  # maxima that are refined
-        if float(score.max()) < _PROMISING:
-            break
-        mode = directions[score.argmax()]
-        score = torch.where(directions @ mode > _APART, -math.inf, score)
-        for span, step in _SPANS:
-            near = _around(mode, span, step)
-            near = near[near @ normal > _LOWEST]
-            shadows = _blurred(surface.shadows(standing, near))
-            found = fine.of_suns(shadows, blurred_ambient[0], _FINE_STRENGTHS) - without
-            with_clock = found + _by_clock(near, captured)
-            i = int(with_clock.argmax())
-            mode = near[i]
-            if float(with_clock[i]) > likeliest:
-                best, likeliest, evidence = mode, float(with_clock[i]), float(found[i])
+    direction, evidence = shown.best(shown.above(_DIRECTIONS), _prior_by_clock(captured.clock))
     if evidence < decisive:
         return None
-    radius, ratio = _radius_and_ratio(picture, standing, ambient, best)
+    radius, ratio = _radius_and_ratio(shown, direction)
     if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
         return None
-    return Sun(best, radius, normal, ratio, evidence)
+    return Sun(direction, radius, shown.surface.plane.normal, ratio, evidence)
 
 
-def _by_clock(directions: Float[Tensor, "k 3"], captured: CapturedScene) -> Float[Tensor, "k"]:
-    """Compute the log density of directions by the clock over that of an even hemisphere, times `_TEMPERATURE`."""
-    towards = clock_directions(captured.clock)
-    if captured.clock is None or not len(towards):
-        return torch.zeros(len(directions))
-    error = math.radians(max(captured.clock.error_deg, _ERROR_DEG))
-    away = (directions @ towards.T).clamp(-1, 1).acos() / error
-    density = torch.exp(-0.5 * away.square()).mean(1) / error**2
-    return _TEMPERATURE * ((1 - _CLOCK_IS_WRONG) * density + _CLOCK_IS_WRONG).log()
+def _prior_by_clock(clock: ClockSun | None) -> LogPrior:
+    """Return the log density by the clock's candidates, any of which may be wrong; even without a clock."""
+    towards = clock_directions(clock)
+    if clock is None or not len(towards):
+        return lambda directions: torch.zeros(len(directions))
+    return _prior_near(towards, max(clock.error_deg, _ERROR_DEG), wrong=_CLOCK_IS_WRONG)
+
+
+def _prior_near(towards: Float[Tensor, "c 3"], error_deg: float, *, wrong: float) -> LogPrior:
+    """Return the log density over that of an even hemisphere, times `_TEMPERATURE`, if one of c directions is right.
+
+    Args:
+        towards: Unit directions of the same probability.
+        error_deg: Their standard error.
+        wrong: Probability that none is right.
+    """
+    error = math.radians(error_deg)
+
+    def log_prior(directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
+        away = (directions @ towards.T).clamp(-1, 1).acos() / error
+        density = torch.exp(-0.5 * away.square()).mean(1) / error**2
+        return _TEMPERATURE * ((1 - wrong) * density + wrong).log()
+
+    return log_prior
 
 
 def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
     """Make the sun that casts the shadows of some points at other given points.
 
-    The direction is the mean over the pairs, the error their spread. Radius and strength are measured at the edges of
-    shadows around the first pair beside which a level surface shows such edges.
+    The mean direction of the pairs is a prior for the search around the first pair whose surroundings show a shadow's
+    edge: the direction moves to the shadows there, which also show radius and strength. If no pair's do, the direction
+    is the mean, its error the spread, and the strength is that of the sources that the sun replaces.
 
     Args:
         points: Pairs, world units: a point that casts a shadow, then the same point of its shadow.
@@ -372,11 +424,37 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
     Raises:
         ValueError: The points are not pairs, or a shadow lies higher than the point that casts it.
     """
+    direction, spread_deg = direction_through(points, captured.up)
+    pairs = torch.tensor(points).reshape(-1, 2, 3)
+    for caster, shadow in pairs.unbind():
+        shown = _ShadowEvidence.of(captured, BoundingSphere(shadow, _AROUND_SHADOW * float((caster - shadow).norm())))
+        near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, *_BY_HAND_SPAN))
+        if shown is None or not len(near):
+            continue
+        found, evidence = shown.best(near, _prior_near(direction[None], _BY_HAND_DEG, wrong=0.0))
+        radius, ratio = _radius_and_ratio(shown, found)
+        if evidence > _PROMISING and ratio is not None and float(ratio @ LUMINANCE) > _MIN_RATIO:
+            return Sun(found, radius, shown.surface.plane.normal, ratio, math.inf, name=SET_BY_HAND)
+    error_deg = max(_ERROR_DEG, spread_deg)
+    name = f"{SET_BY_HAND}, its strength estimated"
+    return Sun(direction, _UNSEEN_RADIUS_DEG, captured.up, None, math.inf, error_deg, name)
+
+
+def direction_through(points: Sequence[Point], up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], float]:
+    """Return the mean direction from shadows to the points that cast them, and the pairs' spread, degrees.
+
+    Args:
+        points: Pairs as for `set_sun`.
+        up: Unit up direction.
+
+    Raises:
+        ValueError: The points are not pairs, or a shadow lies higher than the point that casts it.
+    """
     pairs = torch.tensor(points).reshape(-1, 3)
     if len(pairs) % 2 or not len(pairs):
         raise ValueError(f"sun_through: expected pairs of a point and its shadow, found {len(pairs)} points")
     casters, shadows = pairs[::2], pairs[1::2]
-    towards, up = F.normalize(casters - shadows, dim=1), captured.up
+    towards = F.normalize(casters - shadows, dim=1)
     if float((towards @ up).min()) < _LOWEST:
         i = int((towards @ up).argmin())
         height = float((casters[i] - shadows[i]) @ up)
@@ -386,32 +464,21 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
         )
     direction = F.normalize(towards.mean(0), dim=0)
     spread = torch.rad2deg((towards @ direction).clamp(-1, 1).acos()).square().mean().sqrt()
-    by_hand = Sun(direction, _UNSEEN_RADIUS_DEG, up, None, math.inf, max(_ERROR_DEG, float(spread)), SET_BY_HAND)
-    for caster, shadow in zip(casters, shadows, strict=True):
-        region = BoundingSphere(shadow, _AROUND_SHADOW * float((caster - shadow).norm()))
-        surface = find_surface(captured, region)
-        if surface is None or float(direction @ surface.plane.normal) < _LOWEST:
-            continue
-        standing, picture = standing_on(surface, captured.gaussians, region), draw_surface(captured, surface)
-        radius, ratio = _radius_and_ratio(picture, standing, surface.ambient(standing), direction)
-        if ratio is not None and float(ratio @ LUMINANCE) > 0:
-            return replace(by_hand, radius_deg=radius, normal=surface.plane.normal, ratio=ratio)
-    return replace(by_hand, name=f"{SET_BY_HAND}, its strength estimated")
+    return direction, float(spread)
 
 
-def _radius_and_ratio(
-    picture: SurfacePicture, standing: Occluders, ambient: Float[Tensor, "s s"], direction: Float[Tensor, "3"]
-) -> tuple[float, Float[Tensor, "3"] | None]:
+def _radius_and_ratio(shown: _ShadowEvidence, direction: Float[Tensor, "3"]) -> tuple[float, Float[Tensor, "3"] | None]:
     """Measure a sun's angular radius, degrees, and its irradiance over all other light; None if no edge is seen."""
-    fine, surface = _Comparison.of(picture, _FINE), picture.surface
-    softened = torch.stack([surface.shadows(standing, _cone(direction, radius)).mean(0) for radius in _RADII_DEG])
+    fine = _Comparison.of(shown.picture, _FINE)
+    cones = (shown.surface.shadows(shown.standing, _cone(direction, radius)) for radius in _RADII_DEG)
+    softened = torch.stack([cone.mean(0) for cone in cones])
     by_radius = torch.full((len(_RADII_DEG),), -math.inf)
-    blurred = torch.cat([softened, ambient[None]])
+    blurred = torch.cat([softened, shown.ambient[None]])
     for _ in range(5):  # widths of the reconstruction's blur
         by_radius = torch.maximum(by_radius, fine.of_suns(blurred[:-1], blurred[-1], _FINE_STRENGTHS))
         blurred = _blurred(blurred)
     radius = _RADII_DEG[int((by_radius > by_radius.max() - _SOFTER).int().argmax())]
-    return radius, lit_over_shaded(picture, softened[0], ambient)
+    return radius, lit_over_shaded(shown.picture, softened[0], shown.ambient)
 
 
 def _blurred(visible: Float[Tensor, "k s s"]) -> Float[Tensor, "k s s"]:
@@ -469,10 +536,11 @@ def with_sun(light: Light, sun: Sun) -> Light:
 
     Args:
         light: The estimated light.
-        sun: The sun at the same place. If its ratio is None, it gets the strength of the sources that it replaces, or
-            0.6 of all other light if that is more.
+        sun: The sun at the same place. If its ratio is None, it replaces all sources and gets their strength, or 0.6 of
+            all other light if that is more.
     """
-    others = replace(light, sources=tuple(one for one in light.sources if math.isfinite(one.distance)))
+    kept = () if sun.ratio is None else tuple(one for one in light.sources if math.isfinite(one.distance))
+    others = replace(light, sources=kept)
     before, shaded = (one.irradiance(sun.normal[None])[0] for one in (light, others))
     ratio = (before / shaded - 1).clamp_min(_MIN_RATIO_BY_HAND) if sun.ratio is None else sun.ratio
     scale = float(before @ LUMINANCE) / float((shaded * (1 + ratio)) @ LUMINANCE)
