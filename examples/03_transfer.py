@@ -26,7 +26,7 @@ def main() -> None:
     test = sg.held_out(len(target))
     cameras = target.select(~test).cameras[::3]
     views = sg.render_views(scene, is_object, cameras, prior=prior, prior_confidence=relit.confidence)
-    harmonized = sg.harmonize(views, "compact")
+    harmonized = sg.harmonize(views, "none")  # or an image model, sg.make_harmonizer(sg.FluxOptions(weights="dot3d"))
     result = sg.consolidate(prior, cameras, harmonized.images, weights=harmonized.confidence)
 
     expected = sg.true_views(truth.select(test), target)

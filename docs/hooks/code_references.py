@@ -12,7 +12,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 
 ROOT = Path(__file__).resolve().parents[2]
-_REFERENCE = re.compile(r"`((?:[\w.-]+/)+[\w-]+\.(?:py|safetensors)|(?:[\w-]+/)+)(?:: ([\w., ]+))?`")
+_REFERENCE = re.compile(r"`((?:[\w.-]+/)+[\w-]+\.(?:py)|(?:[\w-]+/)+)(?:: ([\w., ]+))?`")
 _ROOTS = (ROOT / "src/splatgraft", ROOT)
 _OWN = ("src", "benchmarks", "examples", "data", "docs", "tests", ".github", ".ci")
 

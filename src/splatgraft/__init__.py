@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from splatgraft.formats import read_gaussians as load
     from splatgraft.formats import write_gaussians as save
     from splatgraft.harmonization import (
-        CompactOptions,
         FluxOptions,
         Harmonized,
         HarmonizedViews,
@@ -75,7 +74,6 @@ __version__ = "0.1.0"
 __all__ = [
     "Box",
     "Cameras",
-    "CompactOptions",
     "Composite",
     "ConsolidateOptions",
     "FluxOptions",

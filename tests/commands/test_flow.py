@@ -21,7 +21,7 @@ from tiny_project import ball, contents, photograph, plane
 from splatgraft.cli import main
 from splatgraft.core.images import read_rgb, write_image
 from splatgraft.formats import read_gaussians
-from splatgraft.harmonization import HARMONIZERS, CompactOptions, EditOptions, FluxOptions, HarmonizerOptions
+from splatgraft.harmonization import HARMONIZERS, EditOptions, FluxOptions, HarmonizerOptions
 from splatgraft.project.record import read_record, why_stale
 from splatgraft.project.step import FolderCheckpoint, job_of, replacing
 from splatgraft.runtime.settings import choices, field_types
@@ -120,7 +120,10 @@ def test_a_project_that_cannot_be_says_so_in_one_line(project: Path, capsys: pyt
         (("passes = 1", "pases = 1"), "project.toml [consolidate]: expected keys among"),
         (("passes = 1", 'nuisance = "slow"'), "[consolidate] nuisance: expected 'tint-flow' or 'none', found 'slow'"),
         (("[consolidate]", "[harmonize]\nlora = 'a'\n[consolidate]"), 'ray with method = "none"; found lora'),
-        (("[consolidate]", "[harmonize]\nmethod = 'x'\n[consolidate]"), "[harmonize] method: expected one of compact"),
+        (
+            ("[consolidate]", "[harmonize]\nmethod = 'compact'\n[consolidate]"),
+            "[harmonize] method: expected one of edit, flux, none; found 'compact'",
+        ),
         (("budget = 400", "budget = 0"), "expected budget of at least 1, found 0"),
         (("../photos/source", "../photos/gone"), "gone: expected"),
     ):
@@ -160,8 +163,6 @@ def test_every_harmoniser_is_a_sub_command_and_its_keys_stand_beside_it_in_the_t
 @pytest.mark.parametrize(
     ("method", "file"),
     [
-        (CompactOptions(weights="w/compact.safetensors"), "w/compact.safetensors"),
-        (CompactOptions(weights="w"), "w/compact.safetensors"),
         (FluxOptions(weights="w", base="hub/id"), "w/transformer/diffusion_pytorch_model.safetensors"),
         (FluxOptions(weights="hub/id", base="w"), "w/vae/diffusion_pytorch_model.safetensors"),
         (FluxOptions(weights="hub/id", lora=Path("w/lora.safetensors")), "w/lora.safetensors"),
@@ -278,7 +279,6 @@ main(sys.argv[1:])
 @pytest.mark.long
 def test_each_long_step_goes_on_from_its_checkpoint_after_a_kill_inside_of_it(project: Path) -> None:
     # posing photos is another process, which test_colmap_process.py kills
-    project.write_text(project.read_text() + '\n[harmonize]\nmethod = "compact"\n')
     assert main(["run", str(project), "--to", "harmonize"]) == 0
     flow = read_flow(project)
     for name in ("source/reconstruct", "harmonize"):

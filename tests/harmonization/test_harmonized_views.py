@@ -13,7 +13,7 @@ from splatgraft.core.images import read_rgb
 from splatgraft.folders import harmonized_views
 from splatgraft.folders.harmonized_views import Part, finished, harmonize_part, picture_folders
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import CompactOptions, Harmonized, HarmonizerInputs, NoneOptions
+from splatgraft.harmonization import FluxOptions, Harmonized, HarmonizerInputs, NoneOptions
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import job_of, perform
 from splatgraft.runtime.console import Console
@@ -46,7 +46,7 @@ def kept(tmp_path) -> Path:
     return tmp_path / "kept"
 
 
-def step(views, out="out", method=CompactOptions(), **other) -> Harmonize:
+def step(views, out="out", method=NoneOptions(), **other) -> Harmonize:
     return Harmonize(views, views.parent / out, method, device="cpu", **other)
 
 
@@ -56,27 +56,26 @@ def images(folder) -> list[bytes]:
 
 def test_the_method_is_a_sub_command(views, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["harmonize", "compact", str(views), "--out", "new"]) == 0
+    assert main(["harmonize", "none", str(views), "--out", "new"]) == 0
     assert [read_rgb(path).shape for path in sorted((tmp_path / "new" / "images").iterdir())][2] == (16, 32, 3)
-    assert len(list((tmp_path / "new" / "confidence").iterdir())) == 4
-    assert main(["harmonize", "compact", str(views), "--strength", "2"]) == 2
-    assert "--strength: expected a number from 0 to 1, found 2.0" in capsys.readouterr().err
+    assert main(["harmonize", "edit", str(views)]) == 2
+    assert "harmonizer edit: expected --model FOLDER or a hub id" in capsys.readouterr().err
 
 
 def test_help_of_a_method_shows_its_options_and_no_others(capsys):
     with pytest.raises(SystemExit):
-        main(["harmonize", "compact", "--help"])
+        main(["harmonize", "edit", "--help"])
     shown = capsys.readouterr().out
-    for option in ("--out", "--weights", "--strength"):
+    for option in ("--out", "--model", "--sampling-steps"):
         assert option in shown
-    for option in ("--lora", "--checkout", "--max-cost", "--sampling-steps"):
+    for option in ("--lora", "--checkout", "--max-cost", "--precision"):
         assert option not in shown
 
 
 def test_parts_give_the_views_that_the_whole_gives(views, kept):
     whole = perform(step(views), Console())
     for number in range(2):
-        assert harmonize_part(Part(views, CompactOptions(), kept, number, 2, device="cpu")) == 2
+        assert harmonize_part(Part(views, NoneOptions(), kept, number, 2, device="cpu")) == 2
         assert finished(kept, ViewFolder.open(views)) == ({0, 2} if number == 0 else {0, 1, 2, 3})
     assert images(kept) == images(whole)
 
@@ -105,8 +104,8 @@ def test_two_processes_make_the_same_files(views, capsys):
     split = perform(step(views, "split", processes=2), Console())
     assert images(split) == images(alone)
     assert "process 1 of 2 on cpu: 2 views\nprocess 2 of 2 on cpu: 2 views\n" in capsys.readouterr().err
-    with pytest.raises(ValueError, match=r"nothing: expected weights of the compact harmoniser"):
-        perform(step(views, "broken", CompactOptions(weights="nothing"), processes=2), Console())
+    with pytest.raises(ValueError, match=r"harmonizer flux: expected --weights FOLDER or dot3d"):
+        perform(step(views, "broken", FluxOptions(), processes=2), Console())
 
 
 @pytest.mark.long
@@ -120,7 +119,7 @@ def test_the_machine_does_not_make_a_result_stale(views):
     done = step(views)
     perform(done, Console())
     assert why_stale(job_of(replace(done, processes=2, ray="local"))) is None
-    assert why_stale(job_of(replace(done, method=CompactOptions(strength=0.5)))) == "strength is now 0.5, was 1.0"
+    assert why_stale(job_of(replace(done, method=FluxOptions()))) == "method is now flux, was none"
 
 
 class Watched:

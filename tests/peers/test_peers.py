@@ -35,7 +35,7 @@ MISSING = {
     "mv-colight": "harmonizer mv-colight: expected --checkout with the code of",
     "image-editing": "--max-cost: expected at least 0.04 US dollars, found 0.00",
     "flux": "harmonizer flux: expected --weights FOLDER or dot3d",
-    "magic": "expected one of compact, edit, flux, image-editing, lbm, mv-colight, none, reinhard, found 'magic'",
+    "magic": "expected one of edit, flux, image-editing, lbm, mv-colight, none, reinhard, found 'magic'",
 }
 
 

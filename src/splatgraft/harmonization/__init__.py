@@ -4,7 +4,6 @@ from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize, rende
 from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
 from splatgraft.harmonization.methods import (
     HARMONIZERS,
-    CompactOptions,
     EditOptions,
     FluxOptions,
     HarmonizerOptions,
@@ -14,7 +13,6 @@ from splatgraft.harmonization.methods import (
 
 __all__ = [
     "HARMONIZERS",
-    "CompactOptions",
     "EditOptions",
     "FluxOptions",
     "Harmonized",

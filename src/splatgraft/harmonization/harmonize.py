@@ -83,14 +83,14 @@ class HarmonizedViews:
 
 
 def harmonize(
-    views: Sequence[HarmonizerInputs], method: str | Harmonizer = "compact", *, progress: Progress = silent
+    views: Sequence[HarmonizerInputs], method: str | Harmonizer, *, progress: Progress = silent
 ) -> HarmonizedViews:
     """Correct the light on the object in every view, each view by itself.
 
     Args:
         views: v views, as `render_views` gives them; each is read once.
-        method: Name of a method with its default options (`none` keeps the light prior, `compact` is the shipped
-            network, `flux` the paper's model), or a harmoniser made by `make_harmonizer`.
+        method: Harmoniser made by `make_harmonizer`, or the name of a method that needs no options (`none` keeps the
+            light prior).
         progress: Called after every view with views done, v, and the number of the view.
 
     Returns:

@@ -39,29 +39,6 @@ class _Identity:
 
 
 @dataclass(frozen=True)
-class CompactOptions:
-    """Correct the light transfer with the shipped network of 2.4 M parameters; runs on any CPU."""
-
-    name: ClassVar[str] = "compact"
-
-    weights: str | None = None
-    """A compact.safetensors, or the folder of a training; the shipped weights by default."""
-    strength: float = 1.0
-    """Share of the correction that is applied, in [0, 1]."""
-
-    def make(self, context: HarmonizerContext) -> Harmonizer:
-        """Load the compact network."""
-        from splatgraft.harmonization.compact.harmonizer import Compact
-        from splatgraft.harmonization.compact.network import SHIPPED, read_weights
-
-        if not 0 <= self.strength <= 1:
-            raise ValueError(f"--strength: expected a number from 0 to 1, found {self.strength}")
-        path = SHIPPED if self.weights is None else Path(self.weights)
-        network = read_weights(path / SHIPPED.name if path.is_dir() else path)
-        return Compact(network, device=context.device, strength=self.strength)
-
-
-@dataclass(frozen=True)
 class FluxOptions:
     """The paper's image model: FLUX.1-schnell fine-tuned on pairs (Sec. 5)."""
 
@@ -124,9 +101,7 @@ class EditOptions:
         return load_editor(self.model, context, prompt=self.prompt, seed=self.seed, sampling_steps=self.sampling_steps)
 
 
-HARMONIZERS: dict[str, type[HarmonizerOptions]] = {
-    kind.name: kind for kind in (NoneOptions, CompactOptions, FluxOptions, EditOptions)
-}
+HARMONIZERS: dict[str, type[HarmonizerOptions]] = {kind.name: kind for kind in (NoneOptions, FluxOptions, EditOptions)}
 """Options of each method, by its name."""
 
 

@@ -21,7 +21,7 @@ OPTIONAL_DEPENDENCIES = {
     "spz": OptionalDependency(".spz scenes of version 4", {"zstandard": "zstandard"}),
     "flux": OptionalDependency(
         "the paper's image model and its training",
-        {"diffusers": "diffusers", "accelerate": "accelerate", "peft": "peft"},
+        {"diffusers": "diffusers", "accelerate": "accelerate", "peft": "peft", "safetensors": "safetensors"},
     ),
     "text": OptionalDependency("text encoders, to embed the empty prompt once", {"transformers": "transformers"}),
     "blender": OptionalDependency("synthetic scenes with ground truth", {"bpy": "bpy"}),

@@ -16,7 +16,7 @@ from splatgraft.folders.harmonized_views import (
     picture_folders,
 )
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import CompactOptions, EditOptions, FluxOptions, NoneOptions
+from splatgraft.harmonization import EditOptions, FluxOptions, NoneOptions
 from splatgraft.project.step import Context, Device, Inputs, Positional, plain_options
 
 _WEIGHTS = ("weights", "base", "model", "lora")  # options of the methods that name weights
@@ -33,7 +33,6 @@ class Harmonize:
     """Folder for images/, and confidence/ if the method estimates its reliability per pixel."""
     method: (
         Annotated[NoneOptions, subcommand("none")]
-        | Annotated[CompactOptions, subcommand("compact")]
         | Annotated[FluxOptions, subcommand("flux")]
         | Annotated[EditOptions, subcommand("edit")]
     ) = field(default_factory=NoneOptions)

@@ -70,7 +70,7 @@ class Method:
 
     @staticmethod
     def parse(text: str) -> "Method":
-        """Parse a name such as `transfer+compact/l1-dssim@linear` or `lbm=results/lbm`."""
+        """Parse a name such as `transfer+flux/l1-dssim@linear` or `lbm=results/lbm`."""
         if "=" in text:
             name, folder = text.split("=", 1)
             if not name or not Path(folder).is_dir():

@@ -12,7 +12,6 @@ _TABLE = (
     ("synth generated", "generated:GeneratedPairs", "make training pairs of pictures that FLUX paints"),
     ("synth orida", "generated:OridaPairs", "make training pairs of ORIDa's photographs"),
     ("train flux", "train:TrainFlux", "train the paper's harmoniser on pairs"),
-    ("train compact", "train:TrainCompact", "train the compact harmoniser on rendered pairs"),
     ("train removal", "train:TrainRemoval", "train the object removal on pairs"),
     ("train embed", "train:TrainEmbed", "compute the empty prompt's embeddings once"),
 )

@@ -28,7 +28,7 @@ class EvaluateBenchmark:
     out: Path = Path("benchmark")
     """Folder for index.html, benchmark.json, benchmark.md and all results."""
     methods: tuple[str, ...] = ("copy-paste", "reinhard", "gain", "transfer", "true-light")
-    """PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], such as off+flux, transfer+compact/l1-dssim, transfer+compact@geometric;
+    """PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], such as off+flux, transfer+flux/l1-dssim, transfer+flux@geometric;
     or NAME=FOLDER for pictures of another program, FOLDER/SCENE/VIEW.png."""
     only: tuple[str, ...] = ()
     """Names of scenes; default: all."""

@@ -1,6 +1,5 @@
-"""The commands `paper train ...`, for the paper's harmoniser, its object removal, and the compact harmoniser."""
+"""The commands `paper train ...`, for the paper's harmoniser and its object removal."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,15 +8,10 @@ from typing import Annotated, Literal
 import tyro
 
 from splatgraft.harmonization.flux.prompt import TOKENS
-from splatgraft.project.step import Device, Positional, choose_device
+from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.hub import hub_id
-from splatgraft_paper.synthesis.pairs import read_manifest
-from splatgraft_paper.training.compact.loop import CompactOptions, CompactTask
-from splatgraft_paper.training.compact.pairs import CompactPairs, HeldOutOptions
-from splatgraft_paper.training.compact.priors import write_priors
 from splatgraft_paper.training.flux import FluxTrainingOptions, train_flux
-from splatgraft_paper.training.loop import train
 from splatgraft_paper.training.recipes import arguments_with_recipe
 from splatgraft_paper.training.removal import RemovalTrainingOptions, train_removal
 
@@ -61,44 +55,6 @@ class TrainRemoval:
         model = train_removal(self.out, self.options, console)
         if model is not None:
             console.result(model)
-        return 0
-
-
-@dataclass(frozen=True)
-class TrainCompact:
-    """Train the compact harmoniser; a killed run is continued."""
-
-    out: Positional
-    """Folder for compact.safetensors, priors/, state, log and validation pictures."""
-    pairs: Path
-    """Folder that `splatgraft paper synth pairs` rendered."""
-    loop: CompactOptions = field(default_factory=CompactOptions)
-    held_out: HeldOutOptions = field(default_factory=HeldOutOptions)
-    device: Device = "auto"
-
-    def execute(self, console: Console) -> int:
-        """Write the missing priors, train, write the weights."""
-        from splatgraft.harmonization.compact.network import SHIPPED, write_weights
-
-        device = choose_device(self.device, console)
-        samples = read_manifest(self.pairs)
-        folders = sorted({sample.folder for sample in samples})
-        self.out.mkdir(parents=True, exist_ok=True)
-        with console.bar("priors") as progress:
-            write_priors(folders, self.out / "priors", seed=self.loop.seed, progress=progress)
-        with console.bar("read") as progress:
-            pairs = CompactPairs(self.pairs, self.out / "priors", self.held_out, progress)
-        console.say(f"{len(pairs.training)} pairs to train on, {len(pairs.validation)} held out")
-        with console.bar("train") as progress:
-            options = self.loop.loop(cpu=device.type == "cpu")
-            state = train(CompactTask(pairs, self.loop, device), options, self.out, say=console.say, progress=progress)
-        notes = {
-            "pairs": json.dumps({"folders": [folder.name for folder in folders], **pairs.fingerprint()}),
-            "steps": str(self.loop.steps),
-            "seed": str(self.loop.seed),
-        }
-        write_weights(self.out / SHIPPED.name, self.loop.network, state, notes)
-        console.say(f"{self.out / SHIPPED.name}")
         return 0
 
 

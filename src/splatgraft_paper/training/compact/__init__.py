@@ -1,1 +1,0 @@
-"""Training of the compact harmoniser: pairs, light-transfer priors under perturbed lights, loss and task."""
