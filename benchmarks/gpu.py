@@ -342,7 +342,7 @@ def _harmonize_times(network: Any, size: tuple[int, int], setting: Setting) -> R
         return velocity(network.transformer, joined, torch.tensor([level], device=device), network.prompt)
 
     flat, image = torch.zeros(height, width), pictures[0].permute(1, 2, 0).contiguous()
-    view = HarmonizerInputs(image, image, flat, flat, torch.zeros(height, width, 3), image)
+    view = HarmonizerInputs(image, image, flat, flat, image)
     harmonizer = FluxHarmonizer(network)
     work: dict[str, Callable[[], object]] = {
         "encode": lambda: network.autoencoder.encode(padded),

@@ -25,9 +25,9 @@ def main() -> None:
     prior, _ = relit.bake()
     test = sg.held_out(len(target))
     cameras = target.select(~test).cameras[::3]
-    views = sg.render_views(scene, is_object, cameras, prior=prior, prior_confidence=relit.confidence)
+    views = sg.render_views(scene, is_object, cameras, prior=prior)
     harmonized = sg.harmonize(views, "none")  # or an image model, sg.make_harmonizer(sg.FluxOptions(weights="dot3d"))
-    result = sg.consolidate(prior, cameras, harmonized.images, weights=harmonized.confidence)
+    result = sg.consolidate(prior, cameras, harmonized)
 
     expected = sg.true_views(truth.select(test), target)
     images, backgrounds = (list(sg.render(s, target.cameras[test]).color) for s in (result, target_scene))

@@ -1,4 +1,4 @@
-"""The wheel holds all files that the installed package reads: captures of the demo, weights, the report's page."""
+"""The wheel holds all files that the installed package reads: captures of the demo, the report's page."""
 
 import subprocess
 import sys

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from splatgraft.formats import write_gaussians as save
     from splatgraft.harmonization import (
         FluxOptions,
-        Harmonized,
-        HarmonizedViews,
         Harmonizer,
         HarmonizerContext,
         HarmonizerInputs,
@@ -78,8 +76,6 @@ __all__ = [
     "ConsolidateOptions",
     "FluxOptions",
     "Gaussians",
-    "Harmonized",
-    "HarmonizedViews",
     "Harmonizer",
     "HarmonizerContext",
     "HarmonizerInputs",

@@ -7,6 +7,9 @@ harmonised again, from renders of the scene so far, with less noise than before.
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, runtime_checkable
 
+from jaxtyping import Float
+from torch import Tensor
+
 from splatgraft.consolidation import ConsolidateOptions, ImageSequence
 from splatgraft.consolidation.color_fit import Descent, Rates, check_counts, drop_higher_bands, optimize_colors
 from splatgraft.consolidation.frozen_views import Views
@@ -14,7 +17,7 @@ from splatgraft.consolidation.view_errors import CorrectedTargets
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting.perceptual_losses import ImageLoss
-from splatgraft.harmonization import Harmonized, HarmonizerInputs
+from splatgraft.harmonization import HarmonizerInputs
 from splatgraft.rendering import RenderOptions
 from splatgraft.runtime.progress import Checkpoint, NoCheckpoint, Progress, silent
 
@@ -38,13 +41,12 @@ class PaperDescent:
     """Seed of the order of the views."""
 
 
-def descend_as_paper(  # noqa: PLR0913 - three inputs, options, and the two services of every long stage
+def descend_as_paper(
     composite: Gaussians,
     cameras: Cameras,
     images: ImageSequence,
     settings: PaperDescent,
     *,
-    weights: ImageSequence | None = None,
     progress: Progress = silent,
     checkpoint: Checkpoint = NoCheckpoint(),
 ) -> Gaussians:
@@ -57,9 +59,9 @@ def descend_as_paper(  # noqa: PLR0913 - three inputs, options, and the two serv
         ValueError: There is no camera or not one image per camera, or an image has another size than its camera or
             numbers that are not finite.
     """
-    check_counts(cameras, images, weights)
+    check_counts(cameras, images)
     options = ConsolidateOptions(rendering=settings.rendering)
-    targets = CorrectedTargets(Views(composite, cameras, images, weights=weights, options=options), estimated=False)
+    targets = CorrectedTargets(Views(composite, cameras, images, options=options), estimated=False)
     descent = Descent(_RATES, settings.iterations, settings.loss, settings.seed, checkpoint)
     begin = composite.sh if settings.continued else drop_higher_bands(composite.sh)
     return replace(composite, sh=optimize_colors(begin, targets, descent, progress))
@@ -78,6 +80,6 @@ def noise_levels(schedule: Schedule, updates: int) -> tuple[float, ...]:
 class NoisyStartHarmonizer(Protocol):
     """A harmoniser that can start from a partly noisy image, for iterative updates (paper, ablations)."""
 
-    def harmonize_from(self, view: HarmonizerInputs, strength: float) -> Harmonized:
+    def harmonize_from(self, view: HarmonizerInputs, strength: float) -> Float[Tensor, "h w 3"]:
         """Harmonise `view`, conditioned on its composite, starting from its prior at a noise level in (0, 1]."""
         ...

@@ -49,7 +49,7 @@ def ring(views: int, size: int = 48) -> Cameras:
 def views_of(scene: Gaussians, cameras: Cameras, images: Sequence[Tensor], **changes) -> Views:
     """Return views with exact maps, which tests compare with the renderer."""
     exact = ConsolidateOptions(min_row_weight=0.0, cache_bytes=2**24)
-    return Views(scene, cameras, images, weights=changes.pop("weights", None), options=replace(exact, **changes))
+    return Views(scene, cameras, images, options=replace(exact, **changes))
 
 
 def basis_towards(scene: Gaussians, camera: Cameras) -> Tensor:

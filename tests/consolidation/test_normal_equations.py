@@ -19,21 +19,19 @@ def test_equals_dense_ridge_regression(monkeypatch):
     cameras = ring(5, 32)
     generator = torch.Generator().manual_seed(4)
     images = [torch.rand(32, 32, 3, generator=generator) for _ in range(5)]
-    weights = [torch.rand(32, 32, generator=generator) for _ in range(5)]
     for name, value in {"_ROUNDS": 1, "_STEPS": 120, "_PRIOR_PX": 0.5, "_BAND_RIDGES": (0.1,)}.items():
         monkeypatch.setattr(normal_equations, name, value)
     prior = scene.sh.clone()
-    views = views_of(scene, cameras, images, weights=weights)
+    views = views_of(scene, cameras, images)
     found = solve(prior, CorrectedTargets(views, estimated=False))
 
     rows, right, seen = [], [], torch.zeros(40, dtype=torch.float64)
     for index in range(5):
         blend = views[index].operator.blend(torch.eye(40)).reshape(-1, 40).double()
-        root = weights[index].flatten().double().sqrt()[:, None]
         design = (blend[:, :, None] * basis_towards(scene, cameras[index]).double()[None]).reshape(-1, 160)
-        rows.append(root * design)
-        right.append(root * (images[index].reshape(-1, 3).double() - 0.5 * blend.sum(1, keepdim=True)))
-        seen += blend.T @ (root[:, 0] ** 2 * blend.sum(1))
+        rows.append(design)
+        right.append(images[index].reshape(-1, 3).double() - 0.5 * blend.sum(1, keepdim=True))
+        seen += blend.T @ blend.sum(1)
     ridge = (torch.tensor([0.0, 0.1, 0.1, 0.1], dtype=torch.float64) * seen[:, None] + 0.5).flatten()
     matrix, vector = torch.cat(rows), torch.cat(right)
     flat = prior.reshape(160, 3).double()

@@ -11,9 +11,9 @@ from splatgraft.cli import main
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import read_rgb
 from splatgraft.folders import harmonized_views
-from splatgraft.folders.harmonized_views import Part, finished, harmonize_part, picture_folders
+from splatgraft.folders.harmonized_views import Part, finished, harmonize_part
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import FluxOptions, Harmonized, HarmonizerInputs, NoneOptions
+from splatgraft.harmonization import FluxOptions, HarmonizerInputs, NoneOptions
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import job_of, perform
 from splatgraft.runtime.console import Console
@@ -34,15 +34,13 @@ def views(tmp_path) -> Path:
     for i, size in enumerate(sizes):
         composite, mask = torch.rand(size, 32, 3, generator=g), torch.zeros(size, 32)
         mask[4:12, 4:20] = 1
-        flat = torch.zeros(size, 32, 3)
-        folder.write(i, HarmonizerInputs(composite, composite, mask, torch.ones(size, 32), flat, 0.8 * composite))
+        folder.write(i, HarmonizerInputs(composite, composite, mask, torch.ones(size, 32), 0.8 * composite))
     return tmp_path / "views"
 
 
 @pytest.fixture
 def kept(tmp_path) -> Path:
-    (tmp_path / "kept").mkdir()
-    picture_folders(tmp_path / "kept")
+    (tmp_path / "kept" / "images").mkdir(parents=True)
     return tmp_path / "kept"
 
 
@@ -138,7 +136,7 @@ class Watched:
         assert later >= len(self.read) or self.read[later].wait(20), "the next view is not read beside the model"
         assert self.done == 0 or self.written[self.done - 1].wait(20), "the last view is not written beside the model"
         self.done += 1
-        return Harmonized(view.prior)
+        return view.prior
 
 
 def test_files_are_read_and_written_beside_the_model(views, kept, monkeypatch):

@@ -35,7 +35,7 @@ def test_the_pipeline_edits_near_the_object_alone_with_one_seed_for_all_views(fo
     shown.mask.zero_()
     shown.mask[10:20, 10:20] = 1
     harmonizer = editor(folder, said)
-    made = harmonizer.harmonize(shown).image
+    made = harmonizer.harmonize(shown)
     assert said[-1].startswith("edit: FluxKontextPipeline of ")
     assert said[-1].endswith("given the composite alone")
     assert harmonizer.settings["prompt"] == PROMPT
@@ -44,9 +44,9 @@ def test_the_pipeline_edits_near_the_object_alone_with_one_seed_for_all_views(fo
     far[40:] = far[:, 40:] = True
     assert torch.equal(made[far], shown.composite[far])
     assert (made - shown.composite)[10:20, 10:20].abs().mean() > 0.02
-    assert torch.equal(made, harmonizer.harmonize(shown).image)
-    assert not torch.equal(made, editor(folder, seed=1).harmonize(shown).image)
-    assert not torch.equal(made, editor(folder, prompt="a b").harmonize(shown).image)
+    assert torch.equal(made, harmonizer.harmonize(shown))
+    assert not torch.equal(made, editor(folder, seed=1).harmonize(shown))
+    assert not torch.equal(made, editor(folder, prompt="a b").harmonize(shown))
 
 
 def test_the_neighbourhood_is_as_wide_as_the_object_and_fades_out():
@@ -85,7 +85,7 @@ def test_one_photo_is_harmonised_by_its_mask(folder, tmp_path, capsys):
     from splatgraft.harmonization import FluxOptions
 
     read = replace(shown, composite=read_rgb(tmp_path / "composite.png"))
-    wanted = make_harmonizer(FluxOptions(weights=str(flux))).harmonize(read).image
+    wanted = make_harmonizer(FluxOptions(weights=str(flux))).harmonize(read)
     assert (made - wanted).abs().max() <= 0.5 / 255 + 1e-6
     assert main([*words, "edit", "--model", str(folder), "--sampling-steps", "1"]) == 0
     assert not torch.equal(read_rgb(tmp_path / "out.png"), made)

@@ -37,25 +37,22 @@ def scene() -> tuple[Gaussians, torch.Tensor]:
 def test_a_view_shows_composite_background_object_and_prior() -> None:
     composite, is_object = scene()
     prior = replace(composite, sh=composite.sh - 0.1)
-    views = render_views(composite, is_object, cameras(), prior=prior, prior_confidence=0.4)
+    views = render_views(composite, is_object, cameras(), prior=prior)
+    coverage = is_object[:, None].float()
     assert len(views) == 3
     for view, camera in zip(views, cameras(), strict=True):
-        drawn = render(composite, camera, outputs=frozenset({"color", "depth", "normal"}))
+        drawn = render(composite, camera, outputs=frozenset({"color", "depth"}), features=coverage)
         assert torch.equal(view.composite, drawn.color[0].clamp(0, 1))
         assert torch.equal(view.depth, drawn.depth[0])
-        assert torch.equal(view.normal, drawn.normal[0])
         assert torch.equal(view.background, render(composite.select(~is_object), camera).color[0].clamp(0, 1))
         assert torch.equal(view.prior, render(prior, camera).color[0].clamp(0, 1))
-        covered = render(composite, camera, outputs=frozenset(), features=is_object[:, None].float()).features
-        assert torch.equal(view.mask, covered[0, ..., 0].clamp(0, 1))
-        assert view.prior_confidence == 0.4
+        assert torch.equal(view.mask, drawn.features[0, ..., 0].clamp(0, 1))
 
 
 def test_without_a_prior_it_is_the_composite_and_other_flags_are_refused() -> None:
     composite, is_object = scene()
     for view in render_views(composite, is_object, cameras()):
         assert torch.equal(view.prior, view.composite)
-        assert view.prior_confidence == 0
     with pytest.raises(ValueError, match="expected one flag for each of 60 Gaussians, found 59"):
         render_views(composite, is_object[1:], cameras())
 
@@ -65,7 +62,7 @@ def test_without_an_image_model_all_views_keep_the_prior() -> None:
     views = render_views(composite, is_object, cameras(), prior=replace(composite, sh=composite.sh - 0.1))
     calls: list[tuple[int, int]] = []
     found = harmonize(views, "none", progress=lambda done, total, text: calls.append((done, total)))
-    assert all(torch.equal(image, view.prior) for image, view in zip(found.images, views, strict=True))
+    assert all(torch.equal(image, view.prior) for image, view in zip(found, views, strict=True))
     assert calls == [(1, 3), (2, 3), (3, 3)]
     assert len(harmonize(views, make_harmonizer("none"))) == 3
 

@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 import torch
 
@@ -23,9 +22,6 @@ def write_sample(folder, seed=0):
         (folder / take).mkdir(parents=True)
         write_image(folder / take / "0000.png", image)
     write_image(folder / "object0" / "0000_mask.png", mask)
-    write_image(folder / "object0" / "0000_normal.png", torch.full((40, 48, 3), 0.9))
-    write_image(folder / "object0" / "0000_albedo.png", target)
-    np.save(folder / "object0" / "0000_depth.npy", np.ones((40, 48), np.float16))
     takes = [{"name": name} for name in ("background", "object0", "object0_light0")]
     (folder / "job.json").write_text(json.dumps({"takes": takes, "cameras": [{}], "provenance": {"kind": "test"}}))
     return pairs.PairSample(folder, 0, "object0", "light0")
@@ -41,7 +37,7 @@ def test_sound_samples_make_the_manifest_and_come_back(tmp_path):
 BLACK = torch.zeros(40, 48, 3)
 DAMAGES = {
     "truncated": lambda sample: sample.path("background").write_bytes(sample.path("background").read_bytes()[:200]),
-    "no depth": lambda sample: sample.path("object0", "depth").unlink(),
+    "no target": lambda sample: sample.path("object0").unlink(),
     "empty mask": lambda sample: write_image(sample.path("object0", "mask"), BLACK[..., 0]),
     "black": lambda sample: write_image(sample.path("object0"), BLACK),
     "burnt": lambda sample: write_image(sample.path("object0"), 1 - torch.eye(40, 48)[..., None].expand(-1, -1, 3)),

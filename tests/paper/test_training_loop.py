@@ -40,7 +40,7 @@ def killed_at(step):
 def inputs(sample):
     composite, mask = sample.composite, (sample.mask > 0.5).float()
     flat = torch.zeros_like(mask)
-    return HarmonizerInputs(composite, sample.background, mask, flat, torch.zeros_like(composite), composite)
+    return HarmonizerInputs(composite, sample.background, mask, flat, composite)
 
 
 def one_shipped_pair(tmp_path):
@@ -71,7 +71,7 @@ def test_a_trained_model_is_loaded_as_it_was(tmp_path):
     latents = run.cache.encode_missing([run.cache.load(files, objective.roles)], objective.roles)
     shown = objective.predict(objective.network.eval(), latents, 3)
     harmonizer = make_harmonizer(FluxOptions(weights=str(model), seed=3))
-    image = harmonizer.harmonize(inputs(crop_pair_to_size(files.read(), 32, 32))).image
+    image = harmonizer.harmonize(inputs(crop_pair_to_size(files.read(), 32, 32)))
     # kept latents are rounded to bfloat16 (2^-9 of values of about one), fresh ones are not
     assert (image - shown[0].permute(1, 2, 0)).abs().max() < 0.02
     stored = json.loads((model / "transformer" / "config.json").read_text())
@@ -102,7 +102,7 @@ def test_a_trained_adaptation_changes_what_the_base_makes(tmp_path):
     model = training(tmp_path, "out", replace(QUICK, rate=0.05), lora=2).train()
     options = FluxOptions(weights=str(tmp_path / "base"), lora=model / "lora.safetensors")
     pair = open_relit(tmp_path / "pairs").pairs[0].read()
-    image = make_harmonizer(options).harmonize(inputs(pair)).image
+    image = make_harmonizer(options).harmonize(inputs(pair))
     assert image.shape == pair.target.shape
     assert json.loads((model / "harmonizer.json").read_text())["variant"] == "image-mask"
 

@@ -40,12 +40,9 @@ def rendered_folder(folder: Path, count=2, side=32) -> Path:
         scene = folder / f"scene_{name}"
         for take in ("background", "object0", "object0_light0"):
             (scene / take).mkdir(parents=True)
-        grey = sample.mask
         write_image(scene / "background" / "0000.png", sample.background)
         write_image(scene / "object0" / "0000.png", sample.target)
-        for kind in ("mask", "normal", "albedo"):
-            write_image(scene / "object0" / f"0000_{kind}.png", grey[..., None].expand(-1, -1, 3).contiguous())
-        np.save(scene / "object0" / "0000_depth.npy", grey.numpy().astype(np.float16))
+        write_image(scene / "object0" / "0000_mask.png", sample.mask[..., None].expand(-1, -1, 3).contiguous())
         write_image(scene / "object0_light0" / "0000.png", sample.relit[0])
         lines.append(json.dumps({"folder": scene.name, "camera": 0, "object": "object0", "light": "light0"}))
     (folder / "manifest.jsonl").write_text("\n".join(lines) + "\n")

@@ -50,8 +50,8 @@ class HarmonizePhoto:
         if self.background is None and variant == "image-background":
             raise ValueError("--background: expected the picture without the object for this model, found none")
         nothing = torch.zeros(mask.shape)
-        view = HarmonizerInputs(composite, background, mask, nothing, nothing[..., None].expand(-1, -1, 3), composite)
-        write_image(self.out, harmonizer.harmonize(view).image.cpu().clamp(0, 1))
+        view = HarmonizerInputs(composite, background, mask, nothing, composite)
+        write_image(self.out, harmonizer.harmonize(view).cpu().clamp(0, 1))
         console.result(self.out)
         return 0
 

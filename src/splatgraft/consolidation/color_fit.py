@@ -52,7 +52,6 @@ def consolidate(
     images: ImageSequence,
     options: ConsolidateOptions = ConsolidateOptions(),
     *,
-    weights: ImageSequence | None = None,
     progress: Progress = silent,
 ) -> Gaussians:
     """Fit the colours of a scene (all SH bands) to harmonised images of it; geometry and opacity stay.
@@ -69,7 +68,6 @@ def consolidate(
         cameras: v cameras, on the device of `composite`.
         images: v harmonised images (h, w, 3), sRGB in [0, 1], each of its camera's size, read one at a time.
         options: Loss, errors of views, and length of the descent.
-        weights: Confidence of every pixel, v images (h, w) in [0, 1]; 1 by default.
         progress: Called with steps done, steps in all and a short text.
 
     Returns:
@@ -79,8 +77,8 @@ def consolidate(
         ValueError: There is no camera or not one image per camera, or an image has another size than its camera or
             numbers that are not finite.
     """
-    check_counts(cameras, images, weights)
-    views = Views(composite, cameras, images, weights=weights, options=options)
+    check_counts(cameras, images)
+    views = Views(composite, cameras, images, options=options)
     views = restrict_to_changes(views, options.unchanged_below)
     if len(views) == 0:
         return composite
@@ -97,13 +95,12 @@ def consolidate(
     return replace(composite, sh=colors)
 
 
-def check_counts(cameras: Cameras, images: ImageSequence, weights: ImageSequence | None) -> None:
-    """Raise ValueError unless there are views, with one image and one weight each."""
+def check_counts(cameras: Cameras, images: ImageSequence) -> None:
+    """Raise ValueError unless there are views, with one image each."""
     if len(cameras) == 0:
         raise ValueError("consolidate: expected at least one view, found none")
-    for kind, sequence in (("image", images), ("weight", weights)):
-        if sequence is not None and len(sequence) != len(cameras):
-            raise ValueError(f"consolidate: expected one {kind} per camera, found {len(sequence)} for {len(cameras)}")
+    if len(images) != len(cameras):
+        raise ValueError(f"consolidate: expected one image per camera, found {len(images)} for {len(cameras)}")
 
 
 @torch.no_grad()
@@ -181,9 +178,7 @@ def optimize_colors(
         index = _view_of(iteration, len(views), descent.seed)
         view = views[index]
         colors = view.colors(sh).requires_grad_()
-        picture = view.draw(colors)
-        picture, target = _weighted_pair(picture, targets.target(index), views.weight(index))
-        value = descent.loss(picture, target)
+        value = descent.loss(view.draw(colors), targets.target(index))
         rates = descent.rates.first * _decay(iteration / iterations, descent.rates.final_ratio) * shares
         if not view.expansion.descend(sh, torch.autograd.grad(value, colors)[0], moments=moments, rates=rates):
             name = views.cameras.names[index]
@@ -204,13 +199,3 @@ def _view_of(iteration: int, count: int, seed: int) -> int:
 def _decay(done: float, final_ratio: float) -> float:
     """Compute the factor on the learning rate after the share `done` of all steps: a cosine from 1 to `final_ratio`."""
     return final_ratio + (1 - final_ratio) * 0.5 * (1 + math.cos(math.pi * done))
-
-
-def _weighted_pair(
-    picture: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], weight: Float[Tensor, "h w"] | None
-) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]]:
-    """Blend both images by confidence with the detached render, so that any loss ignores pixels of weight 0."""
-    if weight is None:
-        return picture, target
-    share, constant = weight[..., None], picture.detach()
-    return share * picture + (1 - share) * constant, share * target + (1 - share) * constant

@@ -66,11 +66,9 @@ class View:
         values = self.operator.blend_transpose(image)
         return values if self.active is None else values[self.active]
 
-    def blend_and_transpose(
-        self, colors: Float[Tensor, "m 3"], weights: Float[Tensor, "h w"] | None
-    ) -> Float[Tensor, "m 3"]:
-        """Apply `blend`, multiply the pixels by `weights` if given, and apply `blend_transpose`."""
-        values = self.operator.blend_and_transpose(self._of_all(colors), weights)
+    def blend_and_transpose(self, colors: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+        """Apply `blend`, then `blend_transpose`."""
+        values = self.operator.blend_and_transpose(self._of_all(colors))
         return values if self.active is None else values[self.active]
 
     def _of_all(self, colors: Float[Tensor, "m c"]) -> Float[Tensor, "n c"]:
@@ -85,7 +83,7 @@ class Views:
     """v views of one composite, whose `active` Gaussians may change colour.
 
     The first views whose operators fit `options.cache_bytes` are cached; the others are projected and sorted on each
-    access. Images and weights are read one at a time.
+    access. Images are read one at a time.
     """
 
     def __init__(
@@ -94,12 +92,10 @@ class Views:
         cameras: Cameras,
         images: ImageSequence,
         *,
-        weights: ImageSequence | None,
         options: ConsolidateOptions,
     ) -> None:
-        """Make the views; all Gaussians are active and all pixels count."""
-        self.composite, self.cameras, self.images, self.weights = composite, cameras, images, weights
-        self.options = options
+        """Make the views; all Gaussians are active."""
+        self.composite, self.cameras, self.images, self.options = composite, cameras, images, options
         self.active: Tensor | None = None
         self._means = composite.means.float().contiguous()
         self._cached: dict[int, View] = {}
@@ -119,7 +115,6 @@ class Views:
             self.composite,
             self.cameras[chosen].cropped(kept),
             _cropped(self.images, chosen, kept),
-            weights=None if self.weights is None else _cropped(self.weights, chosen, kept),
             options=self.options,
         )
         if not bool(active.all()):
@@ -181,19 +176,13 @@ class Views:
 
     def target(self, index: int) -> Float[Tensor, "h w 3"]:
         """Read the harmonised image of a view."""
-        return self._sized(self.images[index], index, "image")
-
-    def weight(self, index: int) -> Float[Tensor, "h w"] | None:
-        """Read the confidence in each pixel of a view, in [0, 1]; None if all pixels count fully."""
-        return None if self.weights is None else self._sized(self.weights[index], index, "weight")
-
-    def _sized(self, image: Tensor, index: int, kind: str) -> Tensor:
+        image = self.images[index]
         width, height = self.cameras.sizes[index].tolist()
         if tuple(image.shape[:2]) != (height, width):
             found = f"{image.shape[1]}x{image.shape[0]}"
-            raise ValueError(f"{self.cameras.names[index]}: expected {kind} pixels {width}x{height}, found {found}")
+            raise ValueError(f"{self.cameras.names[index]}: expected image pixels {width}x{height}, found {found}")
         if not bool(image.isfinite().all()):
-            raise ValueError(f"{self.cameras.names[index]}: expected finite {kind} pixels, found others")
+            raise ValueError(f"{self.cameras.names[index]}: expected finite image pixels, found others")
         return image
 
 

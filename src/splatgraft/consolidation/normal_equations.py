@@ -56,7 +56,7 @@ class _Equations:
         out = self.ridge[..., None] * sh
         for index in self.which:
             view = self.views[index]
-            colors = view.blend_and_transpose(view.expansion.colors(sh), self.views.weight(index))
+            colors = view.blend_and_transpose(view.expansion.colors(sh))
             view.expansion.add_transpose(colors, out)
         return out
 
@@ -109,9 +109,8 @@ def _build_equations(prior: Float[Tensor, "m k 3"], views: Views, band_ridge: fl
     m, k = prior.shape[:2]
     blocks, seen = prior.new_zeros(m, k, k), prior.new_zeros(m, 1)
     for index in range(len(views)):
-        view, weight = views[index], views.weight(index)
-        share = view.blend(prior.new_ones(m, 1))
-        share = view.blend_transpose(share if weight is None else share * weight[..., None])
+        view = views[index]
+        share = view.blend_transpose(view.blend(prior.new_ones(m, 1)))
         view.expansion.add_squares(share, blocks)
         seen += share
     ridge = _ridge(seen, k, band_ridge)
@@ -136,7 +135,7 @@ def _residual(
         picture = view.render(sh)
         if refine:
             targets.refine(index, picture)
-        difference = _difference(targets, index, picture)
+        difference = targets.target(index) - picture
         view.expansion.add_transpose(view.blend_transpose(difference), out)
         squares += float((difference**2).sum())
         count += difference.numel()
@@ -145,12 +144,7 @@ def _residual(
 
 def _error(sh: Float[Tensor, "m k 3"], targets: CorrectedTargets, which: Sequence[int]) -> float:
     views = targets.views
-    return sum(float(_difference(targets, i, views[i].render(sh)).square().mean()) for i in which)
-
-
-def _difference(targets: CorrectedTargets, index: int, picture: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    difference, weight = targets.target(index) - picture, targets.views.weight(index)
-    return difference if weight is None else difference * weight[..., None]
+    return sum(float((targets.target(i) - views[i].render(sh)).square().mean()) for i in which)
 
 
 def _conjugate_gradient(residual: Float[Tensor, "m k 3"], equations: _Equations) -> Float[Tensor, "m k 3"]:

@@ -45,20 +45,14 @@ def no_view_error(image: Float[Tensor, "h w 3"]) -> ViewError:
 
 
 @torch.no_grad()
-def refine(
-    view_error: ViewError,
-    image: Float[Tensor, "h w 3"],
-    render: Float[Tensor, "h w 3"],
-    weight: Float[Tensor, "h w"] | None,
-) -> ViewError:
+def refine(view_error: ViewError, image: Float[Tensor, "h w 3"], render: Float[Tensor, "h w 3"]) -> ViewError:
     """Take one Gauss-Newton step on the tint of the view's error, then one on its flow; images are sRGB."""
     h, w = image.shape[:2]
-    confidence = image.new_ones(h, w) if weight is None else weight
     warped = _warp(image, _upsample(view_error.flow, h, w))
     tinted = warped * _upsample(view_error.log_gain, h, w).exp()
-    log_gain = _refine_tint(view_error.log_gain, tinted, render, confidence)
+    log_gain = _refine_tint(view_error.log_gain, tinted, render)
     tinted = warped * _upsample(log_gain, h, w).exp()
-    return ViewError(_refine_flow(view_error.flow, tinted, render, confidence), log_gain)
+    return ViewError(_refine_flow(view_error.flow, tinted, render), log_gain)
 
 
 class CorrectedTargets:
@@ -91,7 +85,7 @@ class CorrectedTargets:
             return
         image = self.views.target(index)
         known = self._of_view[index] or no_view_error(image)
-        self._of_view[index] = refine(known, image, render.detach(), self.views.weight(index))
+        self._of_view[index] = refine(known, image, render.detach())
 
     def center(self) -> None:
         """Subtract the mean gain of all views from their errors, because it belongs to the scene."""
@@ -105,11 +99,10 @@ def _refine_tint(
     log_gain: Float[Tensor, "c d 3"],
     tinted: Float[Tensor, "h w 3"],
     render: Float[Tensor, "h w 3"],
-    confidence: Float[Tensor, "h w"],
 ) -> Float[Tensor, "c d 3"]:
     rows, columns = _grid_bases(log_gain, tinted)
     residual = render - tinted
-    robust = _robust_weights(residual, confidence)
+    robust = _robust_weights(residual)
     channels = []
     for channel in range(3):
         slope, knots = tinted[..., channel], log_gain[..., channel]
@@ -126,13 +119,12 @@ def _refine_flow(
     flow: Float[Tensor, "a b 2"],
     tinted: Float[Tensor, "h w 3"],
     render: Float[Tensor, "h w 3"],
-    confidence: Float[Tensor, "h w"],
 ) -> Float[Tensor, "a b 2"]:
     rows, columns = _grid_bases(flow, tinted)
     # a slight blur widens the range of the linearisation to about 1.5 px and keeps noise out of the slopes
     smooth_image, smooth_render = _blur(tinted), _blur(render)
     residual = smooth_render - smooth_image
-    robust = _robust_weights(residual, confidence)
+    robust = _robust_weights(residual)
     dx, dy = _slopes(0.5 * (smooth_image + smooth_render))
     xx, xy, yy = (_over_channels(a * b) * robust for a, b in ((dx, dx), (dx, dy), (dy, dy)))
     right = torch.stack([rows.T @ (robust * _over_channels(d * residual)) @ columns for d in (dx, dy)])
@@ -145,10 +137,10 @@ def _refine_flow(
     return moved.clamp(-_MAX_FLOW_PX, _MAX_FLOW_PX)
 
 
-def _robust_weights(residual: Float[Tensor, "h w 3"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Multiply the confidence by Geman-McClure weights of the residual."""
+def _robust_weights(residual: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w"]:
+    """Compute Geman-McClure weights of the residual."""
     squares = _over_channels(residual**2) / (3 * _RESIDUAL_SIGMA**2)
-    return confidence / (1 + squares) ** 2
+    return 1 / (1 + squares) ** 2
 
 
 def _observations_per_knot(robust: Float[Tensor, "h w"], pixels: int, knots: int) -> float:

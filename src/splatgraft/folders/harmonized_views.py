@@ -14,10 +14,12 @@ from multiprocessing import active_children, get_context
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splatgraft.core.images import stored_size, write_image
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import Harmonized, HarmonizerContext, HarmonizerOptions, make_harmonizer
+from splatgraft.harmonization import HarmonizerContext, HarmonizerOptions, make_harmonizer
 from splatgraft.project.step import choose_device
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.progress import Progress, silent
@@ -37,7 +39,7 @@ class Part:
     method: HarmonizerOptions
     """Options of the harmoniser."""
     kept: Path
-    """Folder for finished images, with images/ and confidence/."""
+    """Folder for finished images, with images/."""
     number: int = 0
     of: int = 1
     device: str = "auto"
@@ -47,12 +49,6 @@ class Part:
         """List the indices of the part's views that are not finished."""
         done = finished(self.kept, views)
         return [i for i in range(self.number, len(views), self.of) if i not in done]
-
-
-def picture_folders(kept: Path) -> None:
-    """Make the folders for finished images."""
-    for name in ("images", "confidence"):
-        (kept / name).mkdir(exist_ok=True)
 
 
 def finished(kept: Path, views: ViewFolder) -> set[int]:
@@ -119,7 +115,5 @@ def harmonize_with_ray(whole: Part, parts: int, *, address: str, progress: Progr
         raise ValueError(failures[0])
 
 
-def _write(kept: Path, stem: str, result: Harmonized) -> None:
-    if result.confidence is not None:
-        write_image(kept / "confidence" / f"{stem}.png", result.confidence)
-    write_image(kept / "images" / f"{stem}.png", result.image)  # last: the view counts as finished
+def _write(kept: Path, stem: str, image: Float[Tensor, "h w 3"]) -> None:
+    write_image(kept / "images" / f"{stem}.png", image)

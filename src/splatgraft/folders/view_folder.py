@@ -1,10 +1,8 @@
 """A folder of rendered views: one file per picture and camera, as `render` writes and later steps read them.
 
-transforms.json  composite/NAME.png  background/  prior/  mask/  normal/NAME.png  depth/NAME.npy
-prior.json       confidence of the light in prior/, 0 to 1, as "trust"
+transforms.json  composite/NAME.png  background/  prior/  mask/  depth/NAME.npy
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -16,13 +14,11 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import read_mask, read_rgb, write_image
 from splatgraft.formats import read_cameras, write_cameras
-from splatgraft.formats.json_file import load, number
 from splatgraft.harmonization import HarmonizerInputs
 from splatgraft.project.layout import CAMERAS_FILE
 from splatgraft.runtime.files import atomic_write
 
-_PRIOR_FILE = "prior.json"
-PICTURES = ("composite", "background", "prior", "mask", "normal", "depth")
+PICTURES = ("composite", "background", "prior", "mask", "depth")
 
 
 def file_stems(cameras: Cameras) -> tuple[str, ...]:
@@ -47,12 +43,11 @@ class ViewFolder:
     """File names of the views, without suffix."""
 
     @staticmethod
-    def create(folder: Path, cameras: Cameras, *, prior_confidence: float = 0.0) -> "ViewFolder":
-        """Make an empty folder of views for `cameras`; `prior_confidence`, in [0, 1], is of the priors' light."""
+    def create(folder: Path, cameras: Cameras) -> "ViewFolder":
+        """Make an empty folder of views for `cameras`."""
         for name in PICTURES:
             (folder / name).mkdir(parents=True, exist_ok=True)
         write_cameras(folder / CAMERAS_FILE, cameras)
-        (folder / _PRIOR_FILE).write_text(json.dumps({"trust": round(prior_confidence, 4)}) + "\n")
         return ViewFolder(folder, cameras, file_stems(cameras))
 
     @staticmethod
@@ -71,13 +66,12 @@ class ViewFolder:
     def files(self) -> tuple[Path, ...]:
         """List all files of the folder."""
         pictures = [self.path(name, i) for name in PICTURES for i in range(len(self))]
-        return (self.folder / CAMERAS_FILE, *pictures, self.folder / _PRIOR_FILE)
+        return (self.folder / CAMERAS_FILE, *pictures)
 
     def write(self, index: int, view: HarmonizerInputs) -> None:
         """Write all pictures of one view."""
         for name in ("composite", "background", "prior", "mask"):
             write_image(self.path(name, index), getattr(view, name))
-        write_image(self.path("normal", index), view.normal * 0.5 + 0.5)
         with atomic_write(self.path("depth", index)) as stream:
             np.save(stream, view.depth.cpu().numpy().astype(np.float32))
 
@@ -85,7 +79,6 @@ class ViewFolder:
         """Read all pictures of one view."""
         composite, background, prior = (read_rgb(self.path(name, index)) for name in PICTURES[:3])
         depth = _read_depth(self.path("depth", index))
-        normal = _normal_from_rgb(read_rgb(self.path("normal", index)))
         mask = read_mask(self.path("mask", index))
         for name, picture in (("background", background), ("prior", prior), ("mask", mask), ("depth", depth)):
             if picture.shape[:2] != composite.shape[:2]:
@@ -97,24 +90,8 @@ class ViewFolder:
             background=background,
             mask=mask,
             depth=depth,
-            normal=normal,
             prior=prior,
-            prior_confidence=self._prior_confidence(),
-            camera_from_world=self.cameras.camera_from_world[index, :3, :3],
         )
-
-    def _prior_confidence(self) -> float:
-        """Read the confidence of the priors' light."""
-        path = self.folder / _PRIOR_FILE
-        return number(path, load(path), "trust")
-
-
-def _normal_from_rgb(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
-    """Decode unit normals of 8-bit pictures; grey, which means no surface, becomes zero."""
-    normal = image * 2 - 1
-    length = normal.norm(dim=-1, keepdim=True)
-    # rounding moves grey from 0, and a normal from length 1, by at most half a level per channel
-    return torch.where(length > 0.5, normal / length.clamp_min(0.5), 0.0)
 
 
 def _read_depth(path: Path) -> Float[Tensor, "h w"]:

@@ -1,7 +1,7 @@
 """Harmonisation of rendered views: an image model corrects the light on an inserted object, one view at a time."""
 
-from splatgraft.harmonization.harmonize import HarmonizedViews, harmonize, render_views
-from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
+from splatgraft.harmonization.harmonize import harmonize, render_views
+from splatgraft.harmonization.interface import Harmonizer, HarmonizerContext, HarmonizerInputs
 from splatgraft.harmonization.methods import (
     HARMONIZERS,
     EditOptions,
@@ -15,8 +15,6 @@ __all__ = [
     "HARMONIZERS",
     "EditOptions",
     "FluxOptions",
-    "Harmonized",
-    "HarmonizedViews",
     "Harmonizer",
     "HarmonizerContext",
     "HarmonizerInputs",

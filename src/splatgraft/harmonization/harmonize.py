@@ -1,21 +1,20 @@
 """Renders the views of a composite, and harmonises them one by one with one method."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerInputs
+from splatgraft.harmonization.interface import Harmonizer, HarmonizerInputs
 from splatgraft.harmonization.methods import make_harmonizer
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.rendering.interface import Output
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft.runtime.progress import Progress, silent
 
-_OUTPUTS: frozenset[Output] = frozenset({"color", "depth", "normal"})
+_OUTPUTS: frozenset[Output] = frozenset({"color", "depth"})
 
 
 def render_views(
@@ -24,7 +23,6 @@ def render_views(
     cameras: Cameras,
     *,
     prior: Gaussians | None = None,
-    prior_confidence: float = 0.0,
     options: RenderOptions = RenderOptions(),
 ) -> LazySequence[HarmonizerInputs]:
     """Render the images that a harmoniser takes, for every view of a composite.
@@ -34,7 +32,6 @@ def render_views(
         is_object: Whether each of them belongs to an object: the second result of `Composite.bake`.
         cameras: v cameras of the target; sizes may differ.
         prior: The scene after light transfer, as `Relit.bake` gives it; the composite itself by default.
-        prior_confidence: Reliability of the light behind `prior`, in [0, 1] (`Relit.confidence`).
         options: Options of the renderer.
 
     Returns:
@@ -60,31 +57,15 @@ def render_views(
             background=draw(background, camera),
             mask=full.features[0, ..., 0].cpu().clamp(0, 1),
             depth=full.depth[0].cpu(),
-            normal=full.normal[0].cpu(),
             prior=color if prior is None or prior is composite else draw(prior, camera),
-            prior_confidence=prior_confidence,
-            camera_from_world=camera.camera_from_world[0, :3, :3].cpu(),
         )
 
     return LazySequence(len(cameras), view)
 
 
-@dataclass(frozen=True)
-class HarmonizedViews:
-    """The harmonised images of v views, as `consolidate` takes them."""
-
-    images: tuple[Float[Tensor, "_ _ 3"], ...]
-    """One (h, w, 3) sRGB image in [0, 1] per view."""
-    confidence: tuple[Float[Tensor, "_ _"], ...] | None
-    """One (h, w) confidence in [0, 1] per view, the `weights` of `consolidate`; None if the method gives none."""
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-
 def harmonize(
     views: Sequence[HarmonizerInputs], method: str | Harmonizer, *, progress: Progress = silent
-) -> HarmonizedViews:
+) -> tuple[Float[Tensor, "_ _ 3"], ...]:
     """Correct the light on the object in every view, each view by itself.
 
     Args:
@@ -94,15 +75,14 @@ def harmonize(
         progress: Called after every view with views done, v, and the number of the view.
 
     Returns:
-        The images and, if the method estimates it, their confidence.
+        One (h, w, 3) sRGB image in [0, 1] per view, as `consolidate` takes them.
 
     Raises:
         ValueError: There is no method of that name, or its weights or packages are missing.
     """
     harmonizer = make_harmonizer(method) if isinstance(method, str) else method
-    made: list[Harmonized] = []
+    images: list[Tensor] = []
     for number, view in enumerate(views, 1):
-        made.append(harmonizer.harmonize(view))
+        images.append(harmonizer.harmonize(view))
         progress(number, len(views), f"view {number}")
-    confidence = tuple(one.confidence for one in made if one.confidence is not None)
-    return HarmonizedViews(tuple(one.image for one in made), confidence if len(confidence) == len(made) else None)
+    return tuple(images)

@@ -18,7 +18,7 @@ from torch import Tensor
 from splatgraft.core.images import resize
 from splatgraft.harmonization.flux.loading import diffusers_library
 from splatgraft.harmonization.flux.tensor_file import one_line
-from splatgraft.harmonization.interface import Harmonized, HarmonizerContext, HarmonizerInputs
+from splatgraft.harmonization.interface import HarmonizerContext, HarmonizerInputs
 
 PROMPT = (
     "I copy-pasted an object from one photograph to the other. I will give you the photograph and the mask of the "
@@ -90,7 +90,7 @@ class ImageEditor:
     """Arguments of every call: prompt and number of steps."""
     seed: int
 
-    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+    def harmonize(self, view: HarmonizerInputs) -> Float[Tensor, "h w 3"]:
         """Edit the composite; pixels away from the object keep the composite's colours."""
         height, width = view.mask.shape
         composite, mask = _picture(view.composite), _picture((view.mask > 0.5).float()[..., None].expand(-1, -1, 3))
@@ -104,7 +104,7 @@ class ImageEditor:
         ).images[0]
         edited = torch.from_numpy(np.array(made.convert("RGB"))).float() / 255
         edited = resize(edited, width, height).clamp(0, 1)
-        return Harmonized(torch.lerp(view.composite.cpu(), edited, near_object(view.mask)[..., None]))
+        return torch.lerp(view.composite.cpu(), edited, near_object(view.mask)[..., None])
 
 
 def near_object(mask: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

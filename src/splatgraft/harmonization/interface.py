@@ -21,32 +21,16 @@ class HarmonizerInputs:
     """Coverage of each pixel by the object, in [0, 1]."""
     depth: Float[Tensor, "h w"]
     """Distance of the composite along the optical axis, world units of the target; 0 where nothing is hit."""
-    normal: Float[Tensor, "h w 3"]
-    """Unit normal of the composite towards the camera, in the target's world; 0 where nothing is hit."""
     prior: Float[Tensor, "h w 3"]
     """The composite after light transfer, sRGB in [0, 1]; equal to `composite` without a transfer."""
-    prior_confidence: float = 0.0
-    """Confidence in the light estimate behind `prior`, in [0, 1]; 0 without a light transfer."""
-    camera_from_world: Float[Tensor, "3 3"] | None = None
-    """World-to-camera rotation (OpenCV axes); None if `normal` is in the camera's frame already."""
-
-
-@dataclass(frozen=True)
-class Harmonized:
-    """The result of harmonising one view."""
-
-    image: Float[Tensor, "h w 3"]
-    """The harmonised view, sRGB in [0, 1]."""
-    confidence: Float[Tensor, "h w"] | None = None
-    """Confidence in each pixel, in [0, 1]; None if the harmoniser does not estimate it."""
 
 
 @runtime_checkable
 class Harmonizer(Protocol):
     """An image model that harmonises one view at a time."""
 
-    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
-        """Harmonise `view`; the image has the same size."""
+    def harmonize(self, view: HarmonizerInputs) -> Float[Tensor, "h w 3"]:
+        """Harmonise `view`; the image has the same size, sRGB in [0, 1]."""
         ...
 
 

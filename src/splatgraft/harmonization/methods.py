@@ -4,7 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
-from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.harmonization.interface import Harmonizer, HarmonizerContext, HarmonizerInputs
 
 
 @runtime_checkable
@@ -33,9 +36,9 @@ class NoneOptions:
 class _Identity:
     """Harmoniser that returns the prior unchanged."""
 
-    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+    def harmonize(self, view: HarmonizerInputs) -> Float[Tensor, "h w 3"]:
         """Return the tensor `view.prior` itself."""
-        return Harmonized(image=view.prior)
+        return view.prior
 
 
 @dataclass(frozen=True)

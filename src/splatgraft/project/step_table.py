@@ -13,7 +13,6 @@ from typing import Any
 from splatgraft.project.layout import (
     CAMERAS_FILE,
     IS_OBJECT_FILE,
-    LIGHT_FILE,
     LIGHT_TEXT_FILE,
     OBJECT_FILE,
     PLACEMENT_FILE,
@@ -115,7 +114,6 @@ STEPS = (
             "cameras": _CAMERAS,
             "is_object": _AT.composite / IS_OBJECT_FILE,
             "prior": _RELIT,
-            "light": _AT.relit / LIGHT_FILE,
         },
     ),
     StepRow(

@@ -96,11 +96,6 @@ class Relit:
     prepared: tuple[PreparedObject, ...] = ()
     """Normals and old light of each object; empty if there was no transfer."""
 
-    @property
-    def confidence(self) -> float:
-        """Reliability of the light, in [0, 1]; 0 if there was no transfer."""
-        return 0.0 if self.light is None else light_confidence(self.light)
-
     def bake(self, weights: LayerWeights = LayerWeights()) -> tuple[Gaussians, Bool[Tensor, "b"]]:
         """Apply the layers, and split wide Gaussians of the target around the objects, as `Composite.bake` does.
 

@@ -277,17 +277,14 @@ class FrozenView:
         """W^T image."""
         return _transpose(self._lists, image)
 
-    def blend_and_transpose(
-        self, values: Float[Tensor, "n 3"], weights: Float[Tensor, "h w"] | None
-    ) -> Float[Tensor, "n 3"]:
-        """W^T (weights * W values); the weights are 1 by default."""
+    def blend_and_transpose(self, values: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """W^T W values."""
         lists, view = self._lists, self._view
-        pixels = np.ones((view.height, view.width), np.float32) if weights is None else _array(weights)
         sums = np.empty((len(lists.entries), values.shape[1]), np.float32)
         with KERNEL_LOCK:
             cpu_frozen.blend_and_transpose(
                 lists.splats, lists.start, lists.entries, lists.rows, lists.slots,
-                lists.in_order(_array(values)), pixels, sums,
+                lists.in_order(_array(values)), (view.height, view.width), sums,
             )  # fmt: skip
             return torch.from_numpy(lists.sum_slots(sums))
 

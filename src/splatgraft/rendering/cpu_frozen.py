@@ -18,7 +18,6 @@ from splatgraft.rendering.cpu_blend import (
     ZERO,
     alpha_row,
     open_tile,
-    read_tile,
     saturated,
     splat_shape,
 )
@@ -96,22 +95,23 @@ def _blend_and_keep(splats, entries, rows, values, x0, y0, work, weights):
 
 @kernel(parallel=True)
 @no_type_check
-def blend_and_transpose(splats, start, entries, rows, slots, values, pixel_weights, sums):
-    """Fill `sums (e, 3)` with `blend_transpose` of the image of `values (m, 3)` times `pixel_weights (h, w)`.
+def blend_and_transpose(splats, start, entries, rows, slots, values, size, sums):
+    """Fill `sums (e, 3)` with `blend_transpose` of the image of `values (m, 3)`; `size`: its height and width.
 
     The weights of a tile's splats are computed once for both, in the rows `rows (e, 2)` of each entry.
     """
+    height, width = size
     for tile in prange(start.shape[0] - 1):
-        x0, y0, work = open_tile(tile, pixel_weights.shape[1], 5)
+        x0, y0, work = open_tile(tile, width, 4)
         listed, places = entries[start[tile] : start[tile + 1]], slots[start[tile] : start[tile + 1]]
         spans = rows[start[tile] : start[tile + 1]]
         weights = np.empty(_count(spans) * TILE, np.float32)
         _blend_and_keep(splats, listed, spans, values, float32(x0), float32(y0), work, weights)
-        read_tile(pixel_weights, x0, y0, work, 4)
-        for at in range(0, PIXELS, TILE):
-            share = load(work, at + 4 * PIXELS)
-            for plane in range(1, 4):
-                store(work, at + plane * PIXELS, load(work, at + plane * PIXELS) * share)
+        for y in range(TILE):  # pixels outside the image count nothing
+            inside = width - x0 if y0 + y < height else 0
+            for x in range(inside, TILE):
+                for plane in range(1, 4):
+                    work[plane * PIXELS + y * TILE + x] = ZERO
         kept = 0
         for k in range(listed.shape[0]):
             red, green, blue = broadcast(ZERO), broadcast(ZERO), broadcast(ZERO)

@@ -102,12 +102,9 @@ class FrozenView:
             values = image.new_zeros(self._gaussians.count, image.shape[-1], requires_grad=True)
             return torch.autograd.grad(self._draw(values)[0], values, image)[0]
 
-    def blend_and_transpose(
-        self, values: Float[Tensor, "n 3"], weights: Float[Tensor, "h w"] | None
-    ) -> Float[Tensor, "n 3"]:
-        """W^T (weights * W values); the weights are 1 by default."""
-        image = self.blend(values)
-        return self.blend_transpose(image if weights is None else image * weights[..., None])
+    def blend_and_transpose(self, values: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """W^T W values."""
+        return self.blend_transpose(self.blend(values))
 
     def transpose_residual(self, values: Float[Tensor, "n"], target: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:
         """W^T (target - W values)."""

@@ -99,10 +99,8 @@ class ViewOperator(Protocol):
         """W^T image."""
         ...
 
-    def blend_and_transpose(
-        self, values: Float[Tensor, "n 3"], weights: Float[Tensor, "h w"] | None
-    ) -> Float[Tensor, "n 3"]:
-        """W^T (weights * W values), with a weight for each pixel; 1 by default."""
+    def blend_and_transpose(self, values: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """W^T W values."""
         ...
 
     def transpose_residual(self, values: Float[Tensor, "n"], target: Float[Tensor, "h w"]) -> Float[Tensor, "n"]:

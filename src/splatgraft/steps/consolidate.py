@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatgraft.consolidation import ConsolidateOptions, consolidate
-from splatgraft.core.images import read_mask, read_rgb
+from splatgraft.core.images import read_rgb
 from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.project.layout import SCENE_FILE
@@ -27,7 +27,7 @@ class Consolidate:
     views: Path
     """The folder that `splatgraft render` wrote, for its cameras."""
     images: Path
-    """The folder that `splatgraft harmonize` wrote: images/, and confidence/ if the method estimates it."""
+    """The folder that `splatgraft harmonize` wrote."""
     out: Path = Path("result")
     """Folder for scene.ply."""
     nuisance: Literal["tint-flow", "none"] = "tint-flow"
@@ -43,20 +43,17 @@ class Consolidate:
     def inputs(self) -> Inputs:
         """Return the scene, the cameras and the harmonised images."""
         views = ViewFolder.open(self.views)
-        images = (*self._images(views), *self._confidence_images(views))
-        return {"scene": (self.scene,), "cameras": views.files()[:1], "images": images}
+        return {"scene": (self.scene,), "cameras": views.files()[:1], "images": self._images(views)}
 
     def write(self, folder: Path, context: Context) -> None:
         """Make scene.ply."""
         device = choose_device(self.device, context.console)
         views = ViewFolder.open(self.views)
-        images, weights = self.read_images(views, device)
         scene = consolidate(
             read_gaussians(self.scene).to(device),
             views.cameras.to(device),
-            images,
+            self.read_images(views, device),
             self.options(),
-            weights=weights,
             progress=context.progress,
         )
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
@@ -69,19 +66,13 @@ class Consolidate:
             rendering=RenderOptions(low_pass=self.low_pass),
         )
 
-    def read_images(self, views: ViewFolder, device: torch.device) -> tuple[Sequence[Tensor], Sequence[Tensor] | None]:
-        """Open the harmonised images and their confidence, which are read on access."""
-        images, confidence = self._images(views), self._confidence_images(views)
-        weights = LazySequence(len(confidence), lambda index: read_mask(confidence[index]).to(device))
-        pictures = LazySequence(len(images), lambda index: read_rgb(images[index]).to(device))
-        return pictures, weights if confidence else None
+    def read_images(self, views: ViewFolder, device: torch.device) -> Sequence[Tensor]:
+        """Open the harmonised images, which are read on access."""
+        images = self._images(views)
+        return LazySequence(len(images), lambda index: read_rgb(images[index]).to(device))
 
     def _images(self, views: ViewFolder) -> tuple[Path, ...]:
         return tuple(self.images / "images" / f"{stem}.png" for stem in views.stems)
-
-    def _confidence_images(self, views: ViewFolder) -> tuple[Path, ...]:
-        folder = self.images / "confidence"
-        return tuple(folder / f"{stem}.png" for stem in views.stems) if folder.is_dir() else ()
 
 
 COMMAND = Consolidate

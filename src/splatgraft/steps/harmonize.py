@@ -13,7 +13,6 @@ from splatgraft.folders.harmonized_views import (
     harmonize_part,
     harmonize_with_processes,
     harmonize_with_ray,
-    picture_folders,
 )
 from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.harmonization import EditOptions, FluxOptions, NoneOptions
@@ -30,7 +29,7 @@ class Harmonize:
     views: Positional
     """The folder that `splatgraft render` wrote for a composite."""
     out: Path = Path("harmonized")
-    """Folder for images/, and confidence/ if the method estimates its reliability per pixel."""
+    """Folder for images/."""
     method: (
         Annotated[NoneOptions, subcommand("none")]
         | Annotated[FluxOptions, subcommand("flux")]
@@ -60,7 +59,7 @@ class Harmonize:
     def write(self, folder: Path, context: Context) -> None:
         """Write one image per view."""
         kept, views = context.checkpoint.folder, ViewFolder.open(self.views)
-        picture_folders(kept)
+        (kept / "images").mkdir(exist_ok=True)
         whole = Part(self.views, self.method, kept, device=self.device)
         if self.ray is not None:
             harmonize_with_ray(whole, self.processes, address=self.ray, progress=context.progress)
@@ -71,9 +70,7 @@ class Harmonize:
         missing = len(views) - len(finished(kept, views))
         if missing:
             raise ValueError(f"{self.views}: expected {len(views)} harmonised views, found {missing} missing")
-        for name in ("images", "confidence"):
-            if any((kept / name).iterdir()):
-                shutil.copytree(kept / name, folder / name)
+        shutil.copytree(kept / "images", folder / "images")
 
 
 def _weight_files(named: Path | str) -> list[Path]:

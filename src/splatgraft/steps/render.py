@@ -15,9 +15,7 @@ from splatgraft.folders.view_folder import ViewFolder, file_stems
 from splatgraft.formats import read_cameras, read_gaussians, write_capture
 from splatgraft.harmonization import render_views
 from splatgraft.project.gaussian_flags import read_selection
-from splatgraft.project.layout import LIGHT_TEXT_FILE
 from splatgraft.project.step import Context, Device, Inputs, choose_device
-from splatgraft.relighting.light.light import light_confidence, light_from_json
 from splatgraft.rendering import RenderOptions, render
 
 
@@ -32,11 +30,9 @@ class Render:
     out: Path = Path("views")
     """Folder for the pictures; for a plain scene it is a capture with images/ and transforms.json."""
     is_object: Path | None = None
-    """is_object.npy of a composite: also write background/, mask/, depth/ and normal/."""
+    """is_object.npy of a composite: also write background/, mask/ and depth/."""
     prior: Path | None = None
     """The relit composite, a .ply, for prior/; the composite itself if not given."""
-    light: Path | None = None
-    """light.json that `relight` wrote beside the prior; gives the prior's reliability, which is 0 if not given."""
     eval: bool = False
     """Leave out every 8th camera, so that `evaluate` has views that no later step has seen."""
     low_pass: Literal["classic", "antialiased"] = "classic"
@@ -45,22 +41,10 @@ class Render:
     """Device to compute on."""
 
     def inputs(self) -> Inputs:
-        """Return the scenes, the cameras and the light."""
+        """Return the scenes and the cameras."""
         optional = {"is_object": self.is_object, "prior": self.prior}
         given = {role: (path,) for role, path in optional.items() if path is not None}
-        if self.light is not None and self.light.is_file():
-            given["light"] = (self.light,)
         return {"scene": (self.scene,), "cameras": camera_files(self.cameras), **given}
-
-    def _prior_confidence(self) -> float:
-        if self.light is None:
-            return 0.0
-        if self.light.is_file():
-            return light_confidence(light_from_json(self.light.read_text(), name=str(self.light)))
-        # `relight` always writes its notes, but a light only if it transferred one
-        if (self.light.parent / LIGHT_TEXT_FILE).is_file():
-            return 0.0
-        raise ValueError(f"{self.light}: expected the light.json that relight wrote, found no such file")
 
     def write(self, folder: Path, context: Context) -> None:
         """Render and write one camera at a time."""
@@ -73,7 +57,7 @@ class Render:
             return _render_plain(scene, cameras, folder=folder, options=options, context=context)
         is_object = read_selection(self.is_object, scene.count, self.scene).to(device)
         prior = None if self.prior is None else read_gaussians(self.prior).to(device)
-        views = ViewFolder.create(folder, cameras.to("cpu"), prior_confidence=self._prior_confidence())
+        views = ViewFolder.create(folder, cameras.to("cpu"))
         for index, view in enumerate(render_views(scene, is_object, cameras, prior=prior, options=options)):
             views.write(index, view)
             context.progress(index + 1, len(cameras), views.stems[index])

@@ -176,11 +176,7 @@ def run_method(
     result = scene.work / "methods" / method.folder_name / "result"
     views = scene.work / "views" / method.prior
     composite = scene.composite / SCENE_FILE
-    # without a transfer, or after a failed one, there is no light
-    light = path if (path := prior.parent / LIGHT_FILE).is_file() else None
-    render = Render(
-        composite, scene.cameras, views, is_object=scene.is_object, prior=prior, light=light, device=settings.device
-    )
+    render = Render(composite, scene.cameras, views, is_object=scene.is_object, prior=prior, device=settings.device)
     seconds["render"] = perform_if_stale(render, console)
     harmonized = scene.work / "harmonized" / f"{method.prior}+{method.harmonizer}"
     step = Harmonize(views, harmonized, options, device=settings.device)

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splatgraft.consolidation import ImageSequence, consolidate
 from splatgraft.core.cameras import Cameras
@@ -17,7 +19,6 @@ from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.harmonization import (
     HARMONIZERS,
-    Harmonized,
     Harmonizer,
     HarmonizerContext,
     HarmonizerInputs,
@@ -63,27 +64,25 @@ class Consolidate(tool.Consolidate):
         views = ViewFolder.open(self.views)
         cameras, loss = views.cameras.to(device), self.image_loss()
         harmonizer = self._noisy_harmonizer(views, device, context.console.say) if self.updates > 1 else None
-        images, weights = self.read_images(views, device)
+        images = self.read_images(views, device)
         descent = PaperDescent(loss, self.iterations, rendering=RenderOptions(low_pass=self.low_pass))
         options = replace(self.options(), loss=loss)
 
-        def fit(scene: Gaussians, images: ImageSequence, weights: ImageSequence | None, *, again: bool) -> Gaussians:
+        def fit(scene: Gaussians, images: ImageSequence, *, again: bool) -> Gaussians:
             if self.method == "fast":
-                return consolidate(scene, cameras, images, options, weights=weights, progress=context.progress)
+                return consolidate(scene, cameras, images, options, progress=context.progress)
             # a fifth fits the times of the paper's Table 4: 5 x 12.5 minutes for the views, 3 for 10,000 steps, 4 x 0.6
             settings = replace(descent, iterations=max(1, self.iterations // 5), continued=True) if again else descent
             kept = NoCheckpoint() if again else context.checkpoint
             services = {"progress": context.progress, "checkpoint": kept}
-            return descend_as_paper(scene, cameras, images, settings, weights=weights, **services)
+            return descend_as_paper(scene, cameras, images, settings, **services)
 
-        scene = fit(read_gaussians(self.scene).to(device), images, weights, again=False)
+        scene = fit(read_gaussians(self.scene).to(device), images, again=False)
         if harmonizer is not None:
             for strength in noise_levels(self.schedule, self.updates)[1:]:
                 shown = _views_of(scene, views, cameras, descent.rendering)
                 made = harmonize(shown, _FromNoise(harmonizer, strength), progress=context.progress)
-                again = [image.to(device) for image in made.images]
-                sure = made.confidence and [one.to(device) for one in made.confidence]
-                scene = fit(scene, again, sure or None, again=True)
+                scene = fit(scene, [image.to(device) for image in made], again=True)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
 
     def image_loss(self) -> ImageLoss:
@@ -121,7 +120,7 @@ class _FromNoise:
     harmonizer: Harmonizer
     strength: float
 
-    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+    def harmonize(self, view: HarmonizerInputs) -> Float[Tensor, "h w 3"]:
         """Harmonise one view."""
         if isinstance(self.harmonizer, NoisyStartHarmonizer):
             return self.harmonizer.harmonize_from(view, self.strength)

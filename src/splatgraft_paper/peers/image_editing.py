@@ -20,7 +20,7 @@ from torch import Tensor
 
 from splatgraft.core.images import resize
 from splatgraft.harmonization.image_editing import PROMPT
-from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
+from splatgraft.harmonization.interface import Harmonizer, HarmonizerContext, HarmonizerInputs
 
 KEY_VARIABLE = "SPLATGRAFT_IMAGE_EDITING_KEY"
 DOLLARS_PER_VIEW = 0.04
@@ -61,7 +61,7 @@ class ImageEditing:
     url: str
     key: str
 
-    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+    def harmonize(self, view: HarmonizerInputs) -> Float[Tensor, "h w 3"]:
         """Send composite and mask to the service and resize the returned image to the view's size."""
         mask = (view.mask > 0.5).float()[..., None].expand(-1, -1, 3)
         pictures = [{"inline_data": {"mime_type": "image/png", "data": _png(one)}} for one in (view.composite, mask)]
@@ -82,7 +82,7 @@ class ImageEditing:
             found = " ".join(answer.split())[:160] or str(error)
             raise ValueError(f"{self.url}: expected a picture in the answer, found {found}") from error
         height, width = view.mask.shape
-        return Harmonized(resize(torch.from_numpy(np.array(image)).float() / 255, width, height))
+        return resize(torch.from_numpy(np.array(image)).float() / 255, width, height)
 
 
 def _png(picture: Float[Tensor, "h w 3"]) -> str:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.harmonization import HARMONIZERS, HarmonizerContext, HarmonizerOptions
-from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerInputs
+from splatgraft.harmonization.interface import Harmonizer, HarmonizerInputs
 from splatgraft.runtime.hub import REPOSITORIES
 from splatgraft_paper.peers.image_editing import ImageEditingOptions
 from splatgraft_paper.peers.mv_colight import MVCoLightOptions
@@ -40,18 +40,18 @@ class ReinhardOptions:
 class Reinhard:
     """Matching of mean and deviation per channel in l-alpha-beta to those in a ring around the object; no shadow."""
 
-    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+    def harmonize(self, view: HarmonizerInputs) -> Float[Tensor, "h w 3"]:
         """Shift the object's colours in the prior; return it unchanged if object or ring has fewer than two pixels."""
         inside = view.mask > 0.5
         around = _ring(inside)
         if int(inside.sum()) < 2 or int(around.sum()) < 2:
-            return Harmonized(image=view.prior)
+            return view.prior
         lab = _lab_from_srgb(view.prior)
         source, surroundings = lab[inside], _lab_from_srgb(view.background)[around]
         flat = source.std(0) <= _FLAT_DEVIATION
         scale = torch.where(flat, 1.0, surroundings.std(0) / source.std(0).clamp_min(_FLAT_DEVIATION))
         matched = _srgb_from_lab((lab - source.mean(0)) * scale + surroundings.mean(0)).clamp(0, 1)
-        return Harmonized(image=torch.lerp(view.prior, matched, view.mask[..., None].clamp(0, 1)))
+        return torch.lerp(view.prior, matched, view.mask[..., None].clamp(0, 1))
 
 
 def _ring(inside: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
@@ -102,12 +102,12 @@ class Lbm:
     evaluate: Any
     """Function `lbm.inference.evaluate`."""
 
-    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+    def harmonize(self, view: HarmonizerInputs) -> Float[Tensor, "h w 3"]:
         """Relight the composite; as in the authors' code, pixels outside the object keep their colours."""
         given = Image.fromarray((view.composite * 255).round().to(torch.uint8).numpy())
         made = self.evaluate(self.model, given, 1).convert("RGB").resize(given.size, Image.Resampling.BICUBIC)
         image = torch.from_numpy(np.array(made)).float() / 255
-        return Harmonized(torch.lerp(view.composite, image, view.mask[..., None].clamp(0, 1)))
+        return torch.lerp(view.composite, image, view.mask[..., None].clamp(0, 1))
 
 
 PEERS = {kind.name: kind for kind in (ReinhardOptions, LbmOptions, MVCoLightOptions, ImageEditingOptions)}

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.images import resize
-from splatgraft.harmonization.interface import Harmonized, Harmonizer, HarmonizerContext, HarmonizerInputs
+from splatgraft.harmonization.interface import Harmonizer, HarmonizerContext, HarmonizerInputs
 from splatgraft.runtime.process import last_line, run_logged
 
 SIDE = 256
@@ -83,7 +83,7 @@ class MVCoLight:
     python: Path
     """Interpreter that runs the network."""
 
-    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+    def harmonize(self, view: HarmonizerInputs) -> Float[Tensor, "h w 3"]:
         """Multiply the composite by the ratio of the network's output and input, upsampled from the network's size."""
         height, width = view.mask.shape
         small = network_input(view)
@@ -99,7 +99,7 @@ class MVCoLight:
                 raise ValueError(f"{self.checkout}: expected MV-CoLight to make a picture, found {last[:200]}")
             made = torch.from_numpy(np.load(out)).clamp(0, 1)
         ratio = (made + RATIO_OFFSET) / (small[:, :3] + RATIO_OFFSET)
-        return Harmonized((view.composite * resize(_joined(ratio, height, width), width, height)).clamp(0, 1))
+        return (view.composite * resize(_joined(ratio, height, width), width, height)).clamp(0, 1)
 
 
 def network_input(view: HarmonizerInputs) -> Float[Tensor, "k 7 256 256"]:

@@ -12,7 +12,7 @@ from splatgraft.runtime.process import run_logged
 from splatgraft.runtime.workers import Task, run_tasks
 from splatgraft_paper.synthesis.scene import Camera, Part, Scene, Vector, World
 
-Pass = Literal["color", "depth", "normal", "albedo", "mask"]
+Pass = Literal["color", "depth", "mask"]
 _WORKER = Path(__file__).parent / "blender" / "worker.py"
 
 

@@ -4,14 +4,8 @@ Files of a scene and camera arc, in `<out>/<scene>_<arc>/`:
 
     job.json, cameras.json, exposure.json    what was rendered, poses (OpenGL axes), exposures
     background/0000.png ...                  the scene without any object, 8-bit sRGB, one file per camera
-    object0/0000.png, _mask, _depth, _normal, _albedo    with object 0: the consistent target and its passes
+    object0/0000.png, 0000_mask.png          with object 0: the consistent target; soft coverage by the object
     object0_light0/0000.png                  object 0 alone under another environment map, RGBA, straight alpha
-    object0_light0_probe/0000.npy, suns.json    that light around the object, linear (64, 128, 3), and its suns
-    place_probe/0000.npy, suns.json          the scene's light at the objects' place, at the exposure of its pictures
-    scene_surface/0000.npy, object0_surface/    points on surfaces, (n, 6): position and outward normal
-
-`mask` is soft coverage (cryptomatte); `depth` is a float16 .npy along the optical axis in metres, 0 for the sky;
-`normal` is 0.5 + 0.5 n in world axes; `albedo` is the diffuse colour, sRGB.
 """
 
 import json
@@ -20,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -30,9 +23,9 @@ from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
 from splatgraft_paper.synthesis import objects
 from splatgraft_paper.synthesis.furniture import placed
-from splatgraft_paper.synthesis.jobs import Job, RenderSize, SurfaceSampling, Take, write_failures
+from splatgraft_paper.synthesis.jobs import Job, RenderSize, Take, write_failures
 from splatgraft_paper.synthesis.places import KINDS, SUPPLIED_MAPS, make_scene
-from splatgraft_paper.synthesis.scene import ARC_LENGTH, World, add, camera_arc
+from splatgraft_paper.synthesis.scene import ARC_LENGTH, World, camera_arc
 
 PAPER_SCENES, PAPER_LIGHTS = 190, 27
 """Numbers of scenes and lights; two objects a scene make the paper's 1,900 targets and over 51,000 composites."""
@@ -81,18 +74,13 @@ def plan(options: PairPlan, number: int) -> Job:
         parts = objects.make(rng.randrange(2**31), place)
         heights.append(max(part.location[2] + part.size[2] / 2 for part in parts))
         things[f"object{i}"] = placed(parts, place.location, rng.uniform(0, 6.283))
-    middle = add(place.location, (0, 0, 0.5 * max(heights)))
-    on_object, on_scene = SurfaceSampling(12_000, middle), SurfaceSampling(100_000, middle)
     takes = [Take("background", scene=True)]
     for name in things:
-        takes.append(Take(name, scene=True, object=name, passes=("color", "mask", "depth", "normal", "albedo")))
+        takes.append(Take(name, scene=True, object=name, passes=("color", "mask")))
         for light in range(options.lights):
             world = World("environment", path=rng.choice(options.maps), rotation=rng.uniform(0, 6.283))
             alone = f"{name}_light{light}"
             takes.append(Take(alone, scene=False, object=name, world=world, exposure_group=alone))
-            takes.append(Take(f"{alone}_probe", scene=False, world=world, exposure_group=alone, probe=middle))
-        takes.append(Take(f"{name}_surface", scene=False, object=name, surface=on_object))
-    takes += [Take("place_probe", scene=True, probe=middle), Take("scene_surface", scene=True, surface=on_scene)]
     cameras = camera_arc(scene, place, max(heights), number)
     provenance = {"kind": kind, "seed": str(options.seed), "number": str(number), "licence": "own render"}
     return Job(scene, things, cameras, tuple(takes), options.size, number, provenance)
@@ -114,8 +102,7 @@ class PairSample:
 
     def path(self, take: str, kind: str = "") -> Path:
         """Return the path of a take's pass for this camera."""
-        suffix = ".npy" if kind == "depth" else ".png"
-        return self.folder / take / f"{self.camera:04d}{'_' + kind if kind else ''}{suffix}"
+        return self.folder / take / f"{self.camera:04d}{'_' + kind if kind else ''}.png"
 
 
 def match_statistics(
@@ -147,7 +134,7 @@ def samples_in(folder: Path) -> list[PairSample]:
         takes, cameras = [take["name"] for take in job["takes"]], len(job["cameras"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected the description of a render job, found {error}") from error
-    alone = [take.split("_") for take in takes if "_light" in take and not take.endswith("_probe")]
+    alone = [words for take in takes if len(words := take.split("_")) == 2 and words[1].startswith("light")]
     return [PairSample(folder, i, name, light) for i in range(cameras) for name, light in alone]
 
 
@@ -155,16 +142,11 @@ def find_defect(sample: PairSample) -> str | None:
     """Describe the first missing, broken, empty, black or clipped picture of a pair in one line, or return None."""
     target_path, background_path = sample.path(sample.object), sample.path("background")
     mask_path, relit_path = sample.path(sample.object, "mask"), sample.path(f"{sample.object}_{sample.light}")
-    depth_path = sample.path(sample.object, "depth")
     try:
         target, background, mask = read_rgb(target_path), read_rgb(background_path), read_rgb(mask_path)[..., 0]
         relit = read_straight_rgb(relit_path)
-        for kind in ("normal", "albedo"):
-            read_rgb(sample.path(sample.object, kind))
-        np.load(depth_path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        said = str(error)
-        return said if "expected" in said else f"{depth_path}: expected a float16 array, found {said}"
+    except ValueError as error:
+        return str(error)
     luma, inside = target.mean(-1), mask > 0.5
     covered, clipped = float(inside.float().mean()), float((luma > 0.995).float().mean())
     mean, deviation = float(luma.mean()), float(luma.std())

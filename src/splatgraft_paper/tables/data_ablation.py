@@ -56,7 +56,7 @@ def measure_models(run: DataAblation, console: Console) -> dict[str, dict[str, f
         for source, pairs in tests.items():
             rows, of_made, of_target = [], [], []
             for pair in pairs:
-                made = harmonizer.harmonize(_view_of(pair)).image.cpu()
+                made = harmonizer.harmonize(_view_of(pair)).cpu()
                 rows.append(measure_picture(made, pair.target, perceptual))
                 if features is not None:
                     of_made.append(features([made]))
@@ -83,13 +83,5 @@ def _test_split(run: DataAblation, option: str) -> Sequence[TrainingPair]:
 
 
 def _view_of(pair: TrainingPair) -> HarmonizerInputs:
-    height, width = pair.mask.shape
-    nothing = torch.zeros(height, width)
-    return HarmonizerInputs(
-        composite=pair.composite,
-        background=pair.background,
-        mask=pair.mask,
-        depth=nothing,
-        normal=torch.zeros(height, width, 3),
-        prior=pair.composite,
-    )
+    nothing = torch.zeros_like(pair.mask)
+    return HarmonizerInputs(pair.composite, pair.background, pair.mask, nothing, pair.composite)

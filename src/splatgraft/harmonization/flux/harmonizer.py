@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatgraft.harmonization.flux.network import FluxNetwork, pad_by_reflection, velocity
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
-from splatgraft.harmonization.interface import Harmonized, HarmonizerInputs
+from splatgraft.harmonization.interface import HarmonizerInputs
 
 
 class FluxHarmonizer:
@@ -18,12 +18,12 @@ class FluxHarmonizer:
         """Use a loaded network; all views share the noise of `seed`."""
         self.network, self._seed, self._steps = network, seed, steps
 
-    def harmonize(self, view: HarmonizerInputs) -> Harmonized:
+    def harmonize(self, view: HarmonizerInputs) -> Float[Tensor, "h w 3"]:
         """Harmonise one view."""
         return self.harmonize_from(view, 1.0)
 
     @torch.no_grad()
-    def harmonize_from(self, view: HarmonizerInputs, strength: float) -> Harmonized:
+    def harmonize_from(self, view: HarmonizerInputs, strength: float) -> Float[Tensor, "h w 3"]:
         """Harmonise one view, starting from its prior at the noise level `strength` in (0, 1].
 
         It takes z_t = (1 - t) z_prior + t eps with t = `strength`, then the steps from t to 0 (SDEdit, Meng et al.
@@ -33,7 +33,7 @@ class FluxHarmonizer:
             prepared = ", ".join(f"{level:g}" for level in self.network.strengths)
             raise ValueError(f"harmonizer flux: expected to start at a noise level of {prepared}, found {strength:g}")
         try:
-            return Harmonized(self._generate(view, strength))
+            return self._generate(view, strength)
         except torch.OutOfMemoryError as error:
             raise ValueError(
                 "harmonizer flux: expected memory for a view, found too little; finished views are kept: try "

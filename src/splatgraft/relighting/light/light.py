@@ -232,8 +232,7 @@ def light_confidence(light: Light) -> float:
     A source counts by its confidence times exp(-(uncertainty / 20 degrees)^2); ambient light counts fully. The share is
     then multiplied by the coverage of the surroundings. The 20 degrees are set by hand.
     """
-    # C0 with 8 digits: more would change the files of priors
-    ambient = math.pi * float(light.ambient[0].mean()) * 0.28209479
+    ambient = math.pi * float(light.ambient[0].mean()) * spherical_harmonics.C0
     total, certain = ambient, ambient
     for source in light.sources:
         total += source.luminance

@@ -57,12 +57,12 @@ def configure(width, height, samples, seed):
     scene.view_settings.view_transform, scene.view_settings.look = "Standard", "None"
     scene.view_settings.exposure = 0.0
     layer = bpy.context.view_layer
-    layer.use_pass_z = layer.use_pass_normal = layer.use_pass_diffuse_color = True
+    layer.use_pass_z = True
     layer.use_pass_cryptomatte_object = True
 
 
 def render(camera, names, matte=()):
-    """Render one camera and return arrays by pass: color (linear RGBA), depth, normal, albedo, mask."""
+    """Render one camera and return arrays by pass: color (linear RGBA), depth, mask."""
     scene = bpy.context.scene
     scene.camera = camera
     with tempfile.TemporaryDirectory() as folder:
@@ -86,7 +86,7 @@ def _write_passes(folder, names, matte):
     out.base_path = folder
     out.format.file_format, out.format.color_depth, out.format.color_mode = "OPEN_EXR", "32", "RGBA"
     out.file_slots.clear()
-    sockets = {"color": "Image", "depth": "Depth", "normal": "Normal", "albedo": "DiffCol"}
+    sockets = {"color": "Image", "depth": "Depth"}
     for name in names:
         out.file_slots.new(name)
         if name == "mask":

@@ -97,10 +97,6 @@ def _write(folder, name, take, arrays, exposure):
             passes.write_png(path + ".png", color)
         elif kind == "depth":
             passes.write_npy(path + ".npy", np.where(arrays["depth"] > 500, 0, arrays["depth"]).astype(np.float16))
-        elif kind == "normal":
-            passes.write_png(path + ".png", arrays["normal"][..., :3] * 0.5 + 0.5)
-        elif kind == "albedo":
-            passes.write_png(path + ".png", passes.srgb(arrays["albedo"][..., :3]))
         else:
             passes.write_png(path + ".png", arrays[kind])
 
