@@ -52,7 +52,6 @@ from splatgraft.relighting.light.samples import LightSamples
 from splatgraft.relighting.light.sun import Sun, find_sun
 from splatgraft.relighting.materials import ReflectedLight, estimate_materials, reflected_light
 from splatgraft.relighting.shading import ShadeSettings, shade_ratio
-from splatgraft.relighting.shadows.catchers import ShadowCatchers
 from splatgraft.relighting.shadows.occlusion import Occlusion, occluded_irradiance, occlusion_from_maps
 from splatgraft.relighting.shadows.receivers import _averaged
 from splatgraft.relighting.shadows.scene_ratio import (
@@ -291,16 +290,6 @@ ROWS: Mapping[str, Row] = {
         {"relighting.layers.split_wide_around": lambda gaussians, is_object, objects: (gaussians, is_object)},
     ),
     # shadow and bounce on the scene
-    "catchers": Row(
-        "shadows",
-        "shadow catchers",
-        {"relighting.cast_shadows.find_catchers": lambda *_, **__: ShadowCatchers.none()},
-    ),
-    "catcher-depth": Row(
-        "shadows",
-        "depth of the catchers corrected by pixels",
-        {"relighting.shadows.catchers._weighed": lambda catchers, *_: catchers},
-    ),
     "view-fit": Row(
         "shadows",
         "fit of the shadow to views",
@@ -335,10 +324,7 @@ ROWS: Mapping[str, Row] = {
     "darkest": Row(
         "shadows",
         "lower limit of shadows",
-        {
-            f"relighting.shadows.{name}.DARKEST": 1e-3
-            for name in ("scene_ratio", "catchers", "view_fit", "surface_views")
-        },
+        {f"relighting.shadows.{name}.DARKEST": 1e-3 for name in ("scene_ratio", "view_fit", "surface_views")},
     ),
     "small-changes": Row("shadows", "removal of small changes", {"relighting.shadows.scene_ratio._MIN_CHANGE": 1e-9}),
     # shadows of the scene

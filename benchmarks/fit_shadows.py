@@ -51,8 +51,7 @@ def shares(scene: ExamScene) -> tuple[list[float], list[float]] | None:
         # the transfer's layers contain today's power
         factor = power / SHADOW_POWER
         ratio = SceneRatio(relit.shadow, relit.bounce, relit.slope).strengthened(factor)
-        depth = factor * relit.catcher_depth
-        result = replace(relit, shadow=ratio.shadow, slope=ratio.slope, catcher_depth=depth).bake()[0]
+        result = replace(relit, shadow=ratio.shadow, slope=ratio.slope).bake()[0]
         everywhere.append(1 - ratio_error(result, scene) / before)
         found = measure_row(result, scene.views)["shadow"]
         assert found is not None

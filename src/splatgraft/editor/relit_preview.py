@@ -73,7 +73,6 @@ def upsample_light(relit: Relit, composite: Composite, parts: Sequence[CoarseGau
         # valid over the width of a coarse Gaussian only
         slope=relit.slope.new_zeros(len(row), *relit.slope.shape[1:]),
         # a coarse composite has none
-        catcher_depth=torch.zeros(len(row)),
         gloss=relit.gloss[row],
         bands_replaced=relit.bands_replaced[row],
         objects=tuple(placed.in_target() for placed in composite.objects),

@@ -15,7 +15,6 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.relighting.normals import raised
 from splatgraft.relighting.prepared_object import PreparedObject
 from splatgraft.relighting.scene_light import SceneLight
-from splatgraft.relighting.shadows.catchers import ShadowCatchers, find_catchers
 from splatgraft.relighting.shadows.receivers import RIM, Receivers, shade_receivers
 from splatgraft.relighting.shadows.scene_ratio import (
     SceneRatio,
@@ -43,8 +42,6 @@ class Shadows:
     """Gaussians of the scene that some object reaches, wide ones split at shadow edges."""
     on_scene: SceneRatio
     """Ratios of the receivers, by all objects together."""
-    catchers: ShadowCatchers
-    """Black Gaussians that shade the scene behind translucent receivers."""
     scene_visibility: tuple[Float[Tensor, "n k"], ...]
     """Share of every light sample that reaches each object's Gaussians past the scene, in [0, 1]."""
     on_objects: tuple[SceneRatio, ...]
@@ -64,14 +61,13 @@ def cast_shadows(
         budget: Largest number of Gaussians that splitting may add to the scene.
     """
     power = SHADOW_POWER if scene.estimate is not None and scene.estimate.sun is None else 1.0
-    receivers, ratio, catchers = _on_scene(scene, objects, drawn, views, budget)
+    receivers, ratio = _on_scene(scene, objects, drawn, views, budget)
     visibility = tuple(
         scene_visibility(scene.maps, raised(one.gaussians, one.normals.vectors), one.normals.vectors) for one in objects
     )
     return Shadows(
         receivers=receivers,
         on_scene=ratio.strengthened(power),
-        catchers=replace(catchers, depth=power * catchers.depth),
         scene_visibility=visibility,
         on_objects=tuple(
             _on_object(one, [other for other in objects if other is not one], shares).strengthened(power)
@@ -82,8 +78,8 @@ def cast_shadows(
 
 def _on_scene(
     scene: SceneLight, objects: Sequence[PreparedObject], drawn: Gaussians, views: Cameras, budget: int
-) -> tuple[Receivers, SceneRatio, ShadowCatchers]:
-    """Find and split the receivers that some object reaches, their ratios by all objects, and catchers."""
+) -> tuple[Receivers, SceneRatio]:
+    """Find and split the receivers that some object reaches, and their ratios by all objects."""
     all_receivers = scene.receivers
     points, rims = all_receivers.gaussians.means, RIM * all_receivers.gaussians.scales.max(1).values
     reached = torch.zeros(len(points), dtype=torch.bool)
@@ -116,14 +112,12 @@ def _on_scene(
         return grey
 
     if not len(views):
-        return receivers, total, ShadowCatchers.none()
+        return receivers, total
     rest = torch.ones(drawn.count, dtype=torch.bool)
     rest[receivers.origin] = False
     whole = concatenate([receivers.gaussians, drawn.select(rest)])
     shown = views_of_surface(receivers, total, whole, views, ratio_at=ratio_at)
-    spacing = 0.05 * min(one.sphere.radius for one in objects)  # set by hand
-    catchers = find_catchers(receivers, total, whole, shown, spacing=spacing)
-    return receivers, fit_to_views(total, whole, shown, catchers.visible), catchers
+    return receivers, fit_to_views(total, whole, shown)
 
 
 def _on_object(one: PreparedObject, others: Sequence[PreparedObject], visibility: Float[Tensor, "n k"]) -> SceneRatio:

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -29,7 +28,6 @@ from splatgraft.relighting.shading import (
     shade_ratio,
     unknown_origin_ratio,
 )
-from splatgraft.relighting.shadows.catchers import with_depth
 from splatgraft.runtime.note import Note
 
 _MIN_SLOPE = 1e-6  # slope of a ratio over view directions; smaller ones are invisible, and below 1e-20 squares are 0
@@ -63,12 +61,11 @@ class Relit:
     """A composite of m Gaussians with its light transfer in layers."""
 
     gaussians: Gaussians
-    """Gaussians without any layer: the target's, then the objects'; large ones in a shadow are split, and invisible
-    shadow catchers are added."""
+    """Gaussians without any layer: the target's, then the objects'; large ones in a shadow are split."""
     is_object: Bool[Tensor, "m"]
     """Whether each Gaussian belongs to an object."""
     origin: Int[Tensor, "m"]
-    """Position of each Gaussian, or of its whole, in `Composite.merged()`; for a catcher that of the surface there."""
+    """Position of each Gaussian, or of its whole, in `Composite.merged()`."""
     shade: Float[Tensor, "m 3"]
     """Factor on linear rgb; 1 outside the objects."""
     shadow: Float[Tensor, "m 3"]
@@ -77,8 +74,6 @@ class Relit:
     """Light reflected by objects over the light without them, at least 0; added to `shadow`."""
     slope: Float[Tensor, "m 3"]
     """View dependence, world axes: its product with the unit vector from the camera is added to shadow and bounce."""
-    catcher_depth: Float[Tensor, "m"]
-    """Optical depth of shadow catchers, invisible at 0; 0 for all other Gaussians."""
     gloss: Float[Tensor, "m k 3"]
     """Coefficients that are added to the harmonics after shading."""
     bands_replaced: Bool[Tensor, "m"]
@@ -126,14 +121,7 @@ class Relit:
             sh[sloped, 1:4] += spherical_harmonics.band_from_slope(slope)
         sh[self.bands_replaced, 1:] *= max(1 - weights.gloss, 0.0)  # more gloss than 1 exaggerates the new one alone
         sh[glossy, : self.gloss.shape[1]] += weights.gloss * self.gloss[glossy]
-        changed = replace(self.gaussians, sh=sh)
-        catchers = (self.catcher_depth > 0).nonzero()[:, 0]
-        if not len(catchers):
-            return changed
-        logits = changed.opacity_logits.clone()
-        visible = with_depth(changed.select(catchers), weights.shadow * self.catcher_depth[catchers])
-        logits[catchers] = visible.opacity_logits
-        return replace(changed, opacity_logits=logits)
+        return replace(self.gaussians, sh=sh)
 
     def ratio(self, weights: LayerWeights = LayerWeights()) -> Float[Tensor, "m 3"]:
         """Compute the factor on linear rgb of shade, tint, exposure, warmth, shadow and bounce together."""
@@ -195,18 +183,16 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
         shadows: Shadows under that light.
     """
     shadings = [_shading(one, scene, shares) for one, shares in zip(objects, shadows.scene_visibility, strict=True)]
-    receivers, on_scene, catchers = shadows.receivers, shadows.on_scene, shadows.catchers
+    receivers, on_scene = shadows.receivers, shadows.on_scene
     rest = torch.ones(scene.captured.gaussians.count, dtype=torch.bool)
     rest[receivers.origin] = False
     rest_index = rest.nonzero()[:, 0]
     object_rows = torch.arange(scene.captured.gaussians.count, merged.count)
-    black = catchers.clear
-    gaussians = concatenate([black, merged.select(rest_index), receivers.gaussians, merged.select(object_rows)])
+    gaussians = concatenate([merged.select(rest_index), receivers.gaussians, merged.select(object_rows)])
     count = gaussians.count - len(object_rows)
-    others = black.count + len(rest_index)
-    ones, zeros = torch.ones(others, 3), torch.zeros(others, 3)
+    ones, zeros = torch.ones(len(rest_index), 3), torch.zeros(len(rest_index), 3)
     replaced = [torch.full((one.gaussians.count,), one.source_lighting is not None) for one in objects]
-    origin = torch.cat([receivers.origin[catchers.receiver], rest_index, receivers.origin, object_rows])
+    origin = torch.cat([rest_index, receivers.origin, object_rows])
     order = origin.argsort(stable=True)
     return Relit(
         gaussians=gaussians.select(order),
@@ -216,7 +202,6 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
         shadow=torch.cat([ones, on_scene.shadow, *[ratio.shadow for ratio in shadows.on_objects]])[order],
         bounce=torch.cat([zeros, on_scene.bounce, *[ratio.bounce for ratio in shadows.on_objects]])[order],
         slope=torch.cat([zeros, on_scene.slope, *[ratio.slope for ratio in shadows.on_objects]])[order],
-        catcher_depth=F.pad(catchers.depth, (0, gaussians.count - black.count))[order],
         gloss=_gloss_layer(gaussians, shadings)[order],
         bands_replaced=torch.cat([torch.zeros(count, dtype=torch.bool), *replaced])[order],
         objects=tuple(one.gaussians for one in objects),
@@ -296,7 +281,6 @@ def pasted(composite: Composite, reason: str) -> Relit:
         shadow=ones,
         bounce=torch.zeros_like(ones),
         slope=torch.zeros_like(ones),
-        catcher_depth=torch.zeros(gaussians.count),
         gloss=torch.zeros_like(gaussians.sh),
         bands_replaced=torch.zeros(gaussians.count, dtype=torch.bool),
         objects=tuple(placed.in_target() for placed in composite.objects if placed.gaussians.count),

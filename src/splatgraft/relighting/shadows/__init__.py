@@ -11,9 +11,8 @@
    (penumbrae, bounce). Limit the ratio: `scene_ratio.ratio_from_sums`.
 5. Average the ratio over Gaussians and split wide ones at shadow edges: `receivers.shade_receivers`.
 6. Find the surface point and its ratio in each pixel of some views: `surface_views.views_of_surface`.
-7. Place black Gaussians where a surface lets light through: `catchers.find_catchers`.
-8. Fit the ratios to these views: `view_fit.fit_to_views`.
-9. Compute shadows of objects on one another: `scene_ratio.scene_ratio`; of an object on itself:
+7. Fit the ratios to these views: `view_fit.fit_to_views`.
+8. Compute shadows of objects on one another: `scene_ratio.scene_ratio`; of an object on itself:
    `scene_ratio.self_visibility`.
 
 Steps 1 and 3 run before `cast_shadows`, when light and objects are prepared. They stay valid while objects move.

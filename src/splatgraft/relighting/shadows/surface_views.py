@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.shadows.receivers import Receivers
 from splatgraft.relighting.shadows.scene_ratio import DARKEST, SceneRatio
 from splatgraft.rendering import ViewOperator, view_operator
@@ -103,28 +103,6 @@ class SurfaceView:
     """Index of the receiver at each point."""
     ratio: Float[Tensor, "p"]
     """Grey ratio of light at each point."""
-
-    def with_catchers(
-        self, gaussians: Gaussians, catchers: Gaussians, values: Float[Tensor, "r"]
-    ) -> tuple[ViewOperator, Float[Tensor, "k"], Float[Tensor, "h w"]]:
-        """Draw the view with black Gaussians, which follow those of the scene in the list.
-
-        Args:
-            gaussians: The scene, receivers first.
-            catchers: Black Gaussians.
-            values: Values of all r receivers.
-
-        Returns:
-            Map from values of all Gaussians to pixels; the k values after the receivers'; the blend of all values.
-        """
-        weights = view_operator(concatenate([gaussians.select(self.which), catchers]), self.camera)
-        fixed = torch.cat([torch.ones(len(self.which) - len(self.receivers)), torch.zeros(catchers.count)])
-        return weights, fixed, weights.blend(torch.cat([values[self.receivers], fixed])[:, None])[..., 0]
-
-    @property
-    def opaque(self) -> Float[Tensor, "p"]:
-        """Share of receivers in the opacity of each point's pixel."""
-        return (self.mass / self.weights.alpha.clamp_min(1e-6))[self.shown]
 
 
 def blended_values(ratio: SceneRatio) -> Float[Tensor, "m"]:

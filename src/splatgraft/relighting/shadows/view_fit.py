@@ -36,8 +36,8 @@ class _FittedView:
 
     which: Int[Tensor, "m"]
     """Positions of the m among all receivers."""
-    fixed: Float[Tensor, "k"]
-    """Values of the other Gaussians."""
+    others: int
+    """Number k of the other Gaussians, whose value is 1."""
     weights: ViewOperator
     """Map from values of these Gaussians to pixels, receivers first."""
     target: Float[Tensor, "h w"]
@@ -48,16 +48,13 @@ class _FittedView:
     """Whether a receiver is wide enough to be drawn at its own width."""
 
 
-def fit_to_views(
-    ratio: SceneRatio, gaussians: Gaussians, views: Sequence[SurfaceView], catchers: Gaussians
-) -> SceneRatio:
+def fit_to_views(ratio: SceneRatio, gaussians: Gaussians, views: Sequence[SurfaceView]) -> SceneRatio:
     """Fit the ratios of receivers to views of their surface.
 
     Args:
         ratio: Ratios at the centres of the m receivers.
         gaussians: The scene, receivers first.
         views: Views of the surface; if there are none, the ratios stay.
-        catchers: Black Gaussians that shade the scene behind the receivers.
 
     Returns:
         The fitted ratios; receivers that no view shows keep theirs.
@@ -65,7 +62,7 @@ def fit_to_views(
     if not views:
         return ratio
     values = blended_values(ratio)
-    value, slope, known = _solved(values, [_fitted(view, values, gaussians, catchers) for view in views])
+    value, slope, known = _solved(values, [_fitted(view, gaussians) for view in views])
     wanted, before = value**GAMMA, ratio.shadow.mean(1).clamp_min(1e-6)
     factor = ((wanted - ratio.bounce.mean(1)) / before).clamp_min(0)
     shadow = (ratio.shadow * factor[:, None]).clamp(DARKEST, 1)
@@ -77,18 +74,16 @@ def fit_to_views(
     )
 
 
-def _fitted(view: SurfaceView, values: Float[Tensor, "m"], gaussians: Gaussians, catchers: Gaussians) -> _FittedView:
-    """Compute the wanted blend of a view's pixels with the catchers in place."""
-    count = len(view.receivers)
-    fixed, weights, target = torch.ones(len(view.which) - count), view.weights, view.value.clone()
-    if catchers.count:
-        weights, fixed, target = view.with_catchers(gaussians, catchers, values)
+def _fitted(view: SurfaceView, gaussians: Gaussians) -> _FittedView:
+    """Compute the wanted blend of a view's pixels."""
+    count, target = len(view.receivers), view.value.clone()
     pixels = view.mass[view.shown] > _RECEIVING
     wanted = view.shown.clone()
     wanted[view.shown] = pixels
-    target[wanted] = weights.alpha[wanted] * view.ratio[pixels] ** (1 / GAMMA)
+    target[wanted] = view.weights.alpha[wanted] * view.ratio[pixels] ** (1 / GAMMA)
     directions = F.normalize(gaussians.means[view.receivers] - view.camera.centers[0], dim=1)
-    return _FittedView(view.receivers, fixed, weights, target, directions, view.drawn_px[:count] > _NARROWEST_PX)
+    is_wide = view.drawn_px[:count] > _NARROWEST_PX
+    return _FittedView(view.receivers, len(view.which) - count, view.weights, target, directions, is_wide)
 
 
 def _solved(
@@ -107,7 +102,7 @@ def _solved(
         change, turn = torch.zeros_like(values), torch.zeros_like(slope)
         for view in views:
             shown = values[view.which] + (slope[view.which] * view.directions).sum(1)
-            seen = torch.cat([shown, view.fixed])
+            seen = torch.cat([shown, torch.ones(view.others)])
             back = view.weights.transpose_residual(seen, view.target)[: len(view.which)]
             change[view.which] += back
             turn[view.which] += back[:, None] * view.directions
