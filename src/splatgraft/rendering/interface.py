@@ -183,13 +183,16 @@ def _implementation(gaussians: Gaussians) -> ModuleType:
 def assemble_render(
     image: Float[Tensor, "v c h w"],
     alpha: Float[Tensor, "v h w"],
-    depth: Float[Tensor, "v h w"],
+    depth: Float[Tensor, "v *size"],
     visible: Bool[Tensor, "v n"],
     *,
     outputs: AbstractSet[Output],
     options: RenderOptions,
 ) -> Render:
-    """Split blended channels, in the order of `CHANNEL_COUNTS` and then features, into a `Render`."""
+    """Split blended channels, in the order of `CHANNEL_COUNTS` and then features, into a `Render`.
+
+    Without the output `depth`, that argument is empty.
+    """
     planes, at = {}, 0
     for name, width in CHANNEL_COUNTS.items():
         if name in outputs:
