@@ -53,7 +53,6 @@ from splatgraft.relighting.light.sun import Sun, find_sun
 from splatgraft.relighting.materials import ReflectedLight, estimate_materials, reflected_light
 from splatgraft.relighting.shading import ShadeSettings, shade_ratio
 from splatgraft.relighting.shadows.occlusion import Occlusion, occluded_irradiance, occlusion_from_maps
-from splatgraft.relighting.shadows.receivers import _averaged
 from splatgraft.relighting.shadows.scene_ratio import (
     SceneShadowMaps,
     object_shadow_maps,
@@ -253,11 +252,6 @@ def changed_sun(captured: CapturedScene, region: Any, **changes: Any) -> Sun | N
     return None if sun is None else replace(sun, **changes)
 
 
-def at_centers(receivers: Any, maps: Any, at: Any, *, ambient: Tensor | None) -> Any:
-    """Keep the variation over each Gaussian, which chooses those that are split, and the values at the centres."""
-    return at, _averaged(receivers, maps, at, ambient=ambient)[1]
-
-
 def density(**changes: float) -> dict[str, object]:
     """Change parameters of the density of the light."""
     return {
@@ -301,12 +295,6 @@ ROWS: Mapping[str, Row] = {
         "splitting of receivers at shadow edges",
         {"relighting.transfer.RelightOptions.budget": lambda self, count: 0},
     ),
-    "averaging": Row(
-        "shadows",
-        "average of the ratio over each receiver; its centre",
-        {"relighting.shadows.receivers._averaged": at_centers},
-    ),
-    "edge-slope": Row("shadows", "slope at shadow edges", {"relighting.shadows.receivers._SHOWS_BEHIND": 0.0}),
     "slope": Row("layers", "all view dependence of shadows", {"relighting.layers.Relit.shaded": without_slope}),
     "power": Row("shadows", "power 1.3 of shadows without a sun", {"relighting.cast_shadows.SHADOW_POWER": 1.0}),
     "source-shadow": Row("shadows", "shadow of the sources", summed_light(partial(occluded, without_source_shadow))),

@@ -98,8 +98,7 @@ def _on_scene(
         total = SceneRatio(
             shadow=total.shadow[parents] * ratio.shadow,
             bounce=total.bounce[parents] + ratio.bounce,
-            slope=total.slope[parents] * ratio.shadow.mean(1, keepdim=True)
-            + total.shadow[parents].mean(1, keepdim=True) * ratio.slope,
+            slope=total.slope[parents],
         )
     assert total is not None
 

@@ -1,11 +1,9 @@
-"""Receivers of shadows: average an object's shadow and bounce over Gaussians, and split wide ones at shadow edges.
+"""Receivers of shadows: an object's shadow and bounce on Gaussians, and splitting of wide ones at shadow edges.
 
 A Gaussian has one colour, so a Gaussian wider than a shadow's edge cannot show it. `shade_receivers` repeats:
 
-1. Average the ratio over each Gaussian, and measure its variation along each axis (`_averaged_ratio`).
+1. Compute the ratio at the centre of each Gaussian, and its variation along each axis (`_varying_ratio`).
 2. Split the Gaussians with the largest variation along that axis, while the budget lasts.
-
-A slope over view directions, in the first band, corrects the place where an edge appears.
 
 A plain surface is a layer of Gaussians whose centres lie above and below it. The layer's middle (`layer_middle`) is the
 surface. Visibility is tested at its top (`above_layer`), because upper Gaussians would shadow lower ones (shadow acne).
@@ -32,19 +30,13 @@ RIM = 2.4
 """Radius of a Gaussian's rim, standard deviations; its alpha is below 0.05 beyond."""
 _LINES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.7, 0.7], [0.7, -0.7]])  # directions, in the two widest axes
 
-# which receivers are split, and how far an edge is corrected; set by hand
+# which receivers are split; set by hand
 _MAX_SPLITS = 12  # most splits of one Gaussian and its pieces, one after another
-_BROAD = 0.1  # object radii (standard deviation); ambient light is averaged over wider Gaussians alone
+_BROAD = 0.1  # object radii (standard deviation); ambient light is compared over wider Gaussians alone
 _FINEST = 0.02  # object radii (standard deviation); no piece gets narrower
 _VARIATION = 0.003  # share of light times alpha below which a Gaussian is not split; small because many overlap
-_FAINTEST = 0.05  # opacity below which a Gaussian is not split and gets no slope
-_NARROWEST = 0.25  # share of the finest width that is split; narrower Gaussians get no slope
+_FAINTEST = 0.05  # opacity below which a Gaussian is not split
 _EDGE = 0.02  # share of light by which rim and centre differ at an edge; a rim shows a twentieth of it
-_SHOWS_BEHIND = 1.2
-"""Distance from a Gaussian's centre to the middle of its visible part, away from the camera, standard deviations.
-
-Splats are blended in the order of their centres, so nearer ones cover the near side. Without this, an edge appears too
-far from all cameras. Measured on planes: 1.0 for opaque Gaussians side by side, 1.4 to 2 for overlapping pieces."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +68,7 @@ class Receivers:
 def shade_receivers(
     receivers: Receivers, maps: ObjectShadowMaps, *, budget: int
 ) -> tuple[Receivers, Int[Tensor, "j"], SceneRatio, Float[Tensor, "3 j 3"]]:
-    """Split receivers at shadow edges and average the ratio over each.
+    """Split receivers at shadow edges, and compute the ratio at the centre of each.
 
     Args:
         receivers: All receivers that the object may reach.
@@ -91,7 +83,7 @@ def shade_receivers(
     pending, which = receivers, torch.arange(len(receivers.origin))
     ambient = _sums(pending, maps, sources=False)
     for round_ in range(_MAX_SPLITS + 1):
-        ratio, variation = _averaged_ratio(pending, maps, ambient)
+        ratio, variation = _varying_ratio(pending, maps, ambient)
         axis = variation.argmax(1)
         wanted = variation.max(1).values
         wanted = torch.where((wanted > _VARIATION) & (pending.gaussians.opacities > _FAINTEST), wanted, 0)
@@ -119,8 +111,7 @@ def shade_receivers(
         origin=torch.cat([r.origin for r, _, _, _ in done]),
     )
     ratios = SceneRatio(
-        # rounds to the precision near 1, as all results so far have it
-        shadow=1 - (1 - torch.cat([ratio.shadow for _, _, ratio, _ in done])),
+        shadow=torch.cat([ratio.shadow for _, _, ratio, _ in done]),
         bounce=torch.cat([ratio.bounce for _, _, ratio, _ in done]),
         slope=torch.cat([ratio.slope for _, _, ratio, _ in done]),
     )
@@ -132,10 +123,10 @@ def _broad(gaussians: Gaussians, maps: ObjectShadowMaps) -> Bool[Tensor, "m"]:
     return gaussians.scales.max(1).values > _BROAD * maps.ambient_maps.window.radius
 
 
-def _averaged_ratio(
+def _varying_ratio(
     receivers: Receivers, maps: ObjectShadowMaps, ambient: Float[Tensor, "3 m 3"]
 ) -> tuple[SceneRatio, Float[Tensor, "m 3"]]:
-    """Average the ratio over each Gaussian, and measure its visible variation along each own axis.
+    """Compute the ratio at each Gaussian's centre, and its visible variation along each own axis.
 
     Variation at a point is weighted by the Gaussian's alpha there. It is 0 along axes too narrow to split.
     """
@@ -149,13 +140,8 @@ def _averaged_ratio(
     fine = _at_an_edge(receivers, maps, fine, (by_sources, ambient)) if lit else fine[:0]
     for which, constant in ((fine, ambient[:, fine]), (broad.nonzero()[:, 0], None)):
         if len(which):
-            mean, moves = _averaged(receivers.select(which), maps, ratio.select(which), ambient=constant)
-            ratio, variation = ratio.with_rows(which, mean), variation.index_copy(0, which, moves)
-    penumbra = _in_penumbra(g, by_sources, ratio, smallest)
-    if len(penumbra):
-        centers = ratio.select(penumbra)
-        slope = _slope_beside(receivers.select(penumbra), maps, centers, ambient=ambient[:, penumbra])
-        ratio = ratio.with_rows(penumbra, replace(centers, slope=slope))
+            moves = _variation(receivers.select(which), maps, ratio.shadow[which], ambient=constant)
+            variation = variation.index_copy(0, which, moves)
     return ratio, torch.where(g.scales < smallest, 0, variation)
 
 
@@ -186,13 +172,23 @@ def _at_an_edge(
     return which[changes.amax((1, 2)) > _EDGE]
 
 
-def _averaged(
-    receivers: Receivers, maps: ObjectShadowMaps, centers: SceneRatio, *, ambient: Float[Tensor, "3 f 3"] | None
-) -> tuple[SceneRatio, Float[Tensor, "f 3"]]:
-    """Average the ratio over f Gaussians from points along both wide axes, and measure its variation along each axis.
+def _variation(
+    receivers: Receivers,
+    maps: ObjectShadowMaps,
+    centers: Float[Tensor, "f 3"],
+    *,
+    ambient: Float[Tensor, "3 f 3"] | None,
+) -> Float[Tensor, "f 3"]:
+    """Measure the variation of the shadow along each axis of f Gaussians, from points along both wide axes.
 
     If `ambient` is None, ambient light is sampled too, and points along the diagonals are added. Otherwise it is
     constant over each Gaussian.
+
+    Args:
+        receivers: The f Gaussians.
+        maps: The object's shadow maps.
+        centers: Shadow at their centres.
+        ambient: The ambient part of the light sums.
     """
     g, lines, line = receivers.gaussians, 2 if ambient is not None else 4, RIM * torch.tensor([-1, -0.5, 0, 0.5, 1])
     beside = line[line != 0]
@@ -202,78 +198,23 @@ def _averaged(
         sums = sums + _sums(receivers, maps, sources=False, points=points)
     else:
         sums = sums + ambient.repeat_interleave(lines * len(beside), 1)
-    there = ratio_from_sums(sums)
-    shadow = _with_center(there.shadow.reshape(g.count, lines, len(beside), 3), centers.shadow)
-    bounce = _with_center(there.bounce.reshape(g.count, lines, len(beside), 3), centers.bounce)
-    # mostly the centre of a Gaussian is visible: weights exp(-x^2), narrower than its alpha exp(-x^2 / 2)
-    weight = torch.exp(-(line**2))[:, None]
-    weight = weight / weight.sum()
+    there = ratio_from_sums(sums).shadow.reshape(g.count, lines, len(beside), 3)
+    half, here = len(beside) // 2, centers[:, None, None].expand(-1, lines, 1, 3)
+    shadow = torch.cat([there[:, :, :half], here, there[:, :, half:]], 2)
     alpha = g.opacities[:, None, None] * torch.exp(-0.5 * line**2)
     moves = ((shadow - shadow.mean(2, keepdim=True)).abs().amax(3) * alpha).amax(2)
     if lines > 2:
         # half of what varies along a diagonal is along either axis
         moves = torch.maximum(moves[:, :2], 0.5 * moves[:, 2:].amax(1, keepdim=True))
-    along = (((shadow + bounce).mean(3) * weight[:, 0] * line).sum(2) / (weight[:, 0] * line**2).sum())[:, :2]
-    mean = SceneRatio(
-        shadow=_ellipse_mean((shadow * weight).sum(2), centers.shadow).clamp(0, 1),
-        bounce=_ellipse_mean((bounce * weight).sum(2), centers.bounce).clamp_min(0),
-        slope=_SHOWS_BEHIND * _in_world(g, along),
-    )
     wide_axes = g.scales.argsort(1, descending=True)[:, :2]
-    return mean, torch.zeros(g.count, 3).scatter(1, wide_axes, moves)
-
-
-def _slope_beside(
-    receivers: Receivers, maps: ObjectShadowMaps, centers: SceneRatio, *, ambient: Float[Tensor, "3 p 3"]
-) -> Float[Tensor, "p 3"]:
-    """Compute slopes of p Gaussians from points beside their centres; ambient light is constant over each."""
-    beside = _points(receivers.gaussians, torch.eye(2))
-    sums = _sums(receivers, maps, sources=True, points=beside) + ambient.repeat_interleave(2, 1)
-    there = ratio_from_sums(sums)
-    here = (centers.shadow + centers.bounce).mean(1, keepdim=True)
-    along = (there.shadow + there.bounce).mean(1).reshape(-1, 2) - here
-    return _SHOWS_BEHIND * _in_world(receivers.gaussians, along)
-
-
-def _with_center(beside: Float[Tensor, "f l s 3"], center: Float[Tensor, "f 3"]) -> Float[Tensor, "f l t 3"]:
-    """Insert the centre's value into the values along lines; t = s + 1."""
-    half = beside.shape[2] // 2
-    there = center[:, None, None].expand(-1, beside.shape[1], 1, 3)
-    return torch.cat([beside[:, :, :half], there, beside[:, :, half:]], 2)
-
-
-def _in_penumbra(
-    gaussians: Gaussians, by_sources: Float[Tensor, "3 m 3"], ratio: SceneRatio, smallest: float
-) -> Int[Tensor, "p"]:
-    """Select receivers in a penumbra that are too narrow to be averaged, but wide enough to show a slope."""
-    without, with_object, _ = by_sources.mean(-1)
-    partly = (with_object > _EDGE * without) & (with_object < (1 - _EDGE) * without)
-    widest = gaussians.scales.max(1).values
-    unknown = (ratio.slope == 0).all(1)
-    visible = (widest > _NARROWEST * smallest) & (gaussians.opacities > _FAINTEST)
-    return (partly & unknown & visible).nonzero()[:, 0]
-
-
-def _in_world(gaussians: Gaussians, along: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
-    """Turn components along the two widest axes into world vectors."""
-    return (_widest(gaussians)[1] @ along[..., None])[..., 0]
-
-
-def _ellipse_mean(along: Float[Tensor, "f l 3"], center: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
-    """Compute the mean over an ellipse: the differences of both axes' means from the centre add up."""
-    return along[:, 0] + along[:, 1] - center
+    return torch.zeros(g.count, 3).scatter(1, wide_axes, moves)
 
 
 def _points(gaussians: Gaussians, offsets: Float[Tensor, "2 p"]) -> Float[Tensor, "n p 3"]:
     """Compute points at `offsets`, which are in standard deviations along the two widest axes."""
-    widths, axes = _widest(gaussians)
-    return gaussians.means[:, None] + ((axes * widths[:, None]) @ offsets).transpose(1, 2)
-
-
-def _widest(gaussians: Gaussians) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 3 2"]]:
-    """Return the two largest scales, and their axes as columns, world frame."""
     widths, axes = gaussians.scales.sort(1, descending=True)
-    return widths[:, :2], torch.gather(gaussians.rotations, 2, axes[:, None, :2].expand(-1, 3, -1))
+    along = torch.gather(gaussians.rotations, 2, axes[:, None, :2].expand(-1, 3, -1)) * widths[:, None, :2]
+    return gaussians.means[:, None] + (along @ offsets).transpose(1, 2)
 
 
 def above_layer(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

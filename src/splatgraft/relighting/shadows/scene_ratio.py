@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
@@ -187,14 +187,6 @@ class SceneRatio:
     def select(self, which: Tensor) -> "SceneRatio":
         """Select receivers by a mask or by indices."""
         return SceneRatio(shadow=self.shadow[which], bounce=self.bounce[which], slope=self.slope[which])
-
-    def with_rows(self, rows: Int[Tensor, "r"], ratio: "SceneRatio") -> "SceneRatio":
-        """Replace the ratios of r receivers."""
-        return SceneRatio(
-            shadow=self.shadow.index_copy(0, rows, ratio.shadow),
-            bounce=self.bounce.index_copy(0, rows, ratio.bounce),
-            slope=self.slope.index_copy(0, rows, ratio.slope),
-        )
 
     def strengthened(self, power: float) -> "SceneRatio":
         """Multiply the logarithm of every shadow by `power`."""
