@@ -75,7 +75,7 @@ def box(half=0.3, count=16) -> tuple[Gaussians, torch.Tensor]:
 def test_a_smooth_surface_is_within_the_bound():
     ball, truth = noisy_ball()
     neighbours = estimate_normals(ball, all_around())
-    fused = fuse_normals(ball, object_views(ball, ORIGIN, all_around()), neighbours, radius=0.5)
+    fused = fuse_normals(ball, object_views(ball, ORIGIN, all_around()), neighbours)
     assert angles_deg(fused.vectors, truth).median() < 4  # the bound for objects, degrees
     assert (angles_deg(fused.vectors, truth) < 90).all()
 
@@ -84,7 +84,7 @@ def test_depth_keeps_edges_that_neighbours_round_off():
     body, truth = box()
     neighbours = estimate_normals(body, all_around())
     views = object_views(body, bounding_sphere(body), all_around())
-    fused = fuse_normals(body, views, neighbours, radius=0.5)
+    fused = fuse_normals(body, views, neighbours)
     # one Gaussian from the edge: the nearest 16 lie on both faces
     near = (body.means.abs().sort(1).values[:, 1] > 0.24) & (body.means.abs().sort(1).values[:, 1] < 0.29)
     before, after = (float(angles_deg(n.vectors, truth)[near].mean()) for n in (neighbours, fused))
@@ -98,7 +98,7 @@ def test_both_sides_of_a_thin_plate_face_outward():
     plate = blobs(torch.cat([torch.cat([grid, side], 1), torch.cat([grid, -side], 1)]), 0.015)
     truth = torch.cat([side.sign(), -side.sign()]) * torch.tensor([[0.0, 0.0, 1.0]])
     neighbours = estimate_normals(plate, all_around())
-    fused = fuse_normals(plate, object_views(plate, bounding_sphere(plate), all_around()), neighbours, radius=0.6)
+    fused = fuse_normals(plate, object_views(plate, bounding_sphere(plate), all_around()), neighbours)
     inner = (plate.means[:, :2].abs() < 0.3).all(1)
     assert angles_deg(fused.vectors, truth)[inner].median() < 10  # the blobs' own bumps are a few degrees
     assert (angles_deg(fused.vectors, truth)[inner] < 90).float().mean() > 0.98
@@ -111,7 +111,7 @@ def test_without_views_the_estimate_by_neighbours_stays():
     views = object_views(ball, ORIGIN, away)
     assert views == ()
     neighbours = estimate_normals(ball, all_around())
-    fused = fuse_normals(ball, views, neighbours, radius=0.5)
+    fused = fuse_normals(ball, views, neighbours)
     assert torch.allclose(fused.vectors, neighbours.vectors, atol=1e-6)
     assert torch.equal(fused.confidence, neighbours.confidence)
 

@@ -88,7 +88,6 @@ _normalize = torch.nn.functional.normalize
 # normals from depth; chosen on eight scenes with true normals, flat around these values
 _REACH = 2  # pixels from the middle of the fitted window to its edge; the best of 1, 2, 3
 _WINDOW = 1.4  # pixels; standard deviation of the window's weights
-_SAME_SURFACE = 0.1  # object radii; standard deviation of depth in a window, against windows across an edge
 _COVERED = 0.5  # smallest alpha of a pixel that shows the object
 _MIN_FILLED = 0.3  # smallest share of the window's weight on the object
 _MIN_PIXELS = 0.5  # pixels of a Gaussian in all views together at which the weight of its depth is half
@@ -98,21 +97,20 @@ _NEIGHBOURS = 2.0
 On a smooth surface a larger weight averages more noise (5.0 degrees instead of 7.5); near edges it misleads."""
 
 
-def fuse_normals(gaussians: Gaussians, views: tuple[ObjectView, ...], neighbours: Normals, *, radius: float) -> Normals:
+def fuse_normals(gaussians: Gaussians, views: tuple[ObjectView, ...], neighbours: Normals) -> Normals:
     """Fuse normals from depth images with normals from neighbours.
 
     Args:
         gaussians: The n Gaussians of an object.
         views: Views of the object alone; without any, `neighbours` is the result.
         neighbours: Estimate from the Gaussians' own shapes.
-        radius: Radius of the object, world units.
 
     Returns:
         Normals, with the agreement of both estimates as confidence, in [0, 1].
     """
     total = torch.zeros(gaussians.count, 4)
     for view in views:
-        normals, weight = _normals_of(_inverse_depth(gaussians, view), view, radius)
+        normals, weight = _normals_of(_inverse_depth(gaussians, view), view)
         total += view.operator.blend_transpose(torch.cat([normals * weight, weight], 2).contiguous())
     pixels = total[:, 3:]
     by_depth = _normalize(total[:, :3], dim=1) * pixels / (pixels + _MIN_PIXELS)
@@ -137,7 +135,7 @@ def _inverse_depth(gaussians: Gaussians, view: ObjectView) -> Float[Tensor, "h w
 
 
 def _normals_of(
-    inverse: Float[Tensor, "h w"], view: ObjectView, radius: float
+    inverse: Float[Tensor, "h w"], view: ObjectView
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w 1"]]:
     """Fit world normals towards the camera by weighted least squares over windows, with the view's cosine as weight."""
     h, w = inverse.shape
@@ -147,10 +145,7 @@ def _normals_of(
     gauss = torch.exp(-(across**2 + down**2) / (2 * _WINDOW**2))
     # rows: pixels of the window; columns: its middle
     values = torch.nn.functional.unfold(inverse[None, None], 2 * reach + 1, padding=reach)[0]
-    middle = inverse.reshape(1, -1)
-    depth = 1 / middle.clamp_min(1e-9)
-    off = (values - middle) * depth * depth / (_SAME_SURFACE * radius)
-    weight = gauss * (values > 0) * (middle > 0) * torch.exp(-0.5 * off**2)
+    weight = gauss * (values > 0) * (inverse.reshape(1, -1) > 0)
     sum_ = weight.sum(0).clamp_min(1e-9)
 
     def mean(term: Tensor) -> Tensor:

@@ -212,7 +212,7 @@ def _normals(
     """Return the object's normals in the target's frame: the source's, or an estimate."""
     if source is None or source.normals is None:
         neighbours = estimate_normals(in_target, cameras)
-        return fuse_normals(in_target, views, neighbours, radius=bounding_sphere(in_target).radius)
+        return fuse_normals(in_target, views, neighbours)
     if len(source.normals) != in_target.count:
         raise ValueError(f"relight: expected {in_target.count} normals, found {len(source.normals)}")
     turned = source.normals @ placed.target_from_object.rotation.to(source.normals).T

@@ -19,10 +19,8 @@ from splatgraft.relighting.light.samples import LightSamples
 
 @dataclass(frozen=True)
 class ShadeSettings:
-    """Limits of the shading ratio."""
+    """Shares of the shading ratio's mean, and light that no sample represents."""
 
-    span: float = 5.0
-    """Largest factor between a Gaussian's ratio and the object's mean ratio; set by hand."""
     floor: float = 0.08
     """Share of the mean irradiance that is added to all: interreflections that no sample represents; set by hand."""
     level_share: float = 0.4
@@ -71,8 +69,7 @@ def shade_ratio(
 ) -> Float[Tensor, "n 3"]:
     """Compute the factor on an object's linear colours: irradiance at the new place over irradiance at the old one.
 
-    The factor is floored, and limited around the object's geometric mean. The settings' shares of that mean are
-    applied.
+    The settings' shares of the object's geometric mean ratio are applied.
 
     Args:
         target: Linear irradiance at the new place.
@@ -81,8 +78,7 @@ def shade_ratio(
         settings: Limits and shares.
     """
     scaled = target * light_scale(target, source, opacities, settings=settings)
-    log_ratio = (_floored(scaled, opacities, settings) / _floored(source, opacities, settings)).log()
-    return _limited(log_ratio, opacities, settings)
+    return _floored(scaled, opacities, settings) / _floored(source, opacities, settings)
 
 
 def light_scale(
@@ -115,7 +111,7 @@ def unknown_origin_ratio(target: Float[Tensor, "n 3"], opacities: Float[Tensor, 
     """
     settings = ShadeSettings()
     log_ratio = 0.5 * _floored(target, opacities, settings).log()  # set by hand
-    return _limited(log_ratio - _mean(log_ratio, opacities), opacities, settings)
+    return (log_ratio - _mean(log_ratio, opacities)).exp()
 
 
 def _mean(values: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> Float[Tensor, "1 3"]:
@@ -127,14 +123,6 @@ def _floored(
     values: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], settings: ShadeSettings
 ) -> Float[Tensor, "n 3"]:
     return (values + settings.floor * _mean(values, opacities)).clamp_min(1e-6)
-
-
-def _limited(
-    log_ratio: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"], settings: ShadeSettings
-) -> Float[Tensor, "n 3"]:
-    """Limit the variation of a ratio around its mean."""
-    mean, span = _mean(log_ratio, opacities), math.log(settings.span)
-    return (mean + (log_ratio - mean).clamp(-span, span)).exp()
 
 
 def apply_gain(gaussians: Gaussians, gain: Float[Tensor, "3"] | Float[Tensor, "n 3"]) -> Gaussians:

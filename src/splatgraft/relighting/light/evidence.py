@@ -36,7 +36,6 @@ _MAX_RECEIVERS = 1000  # gaussians, chosen at random
 _MIN_RECEIVERS = 200  # gaussians; fewer are no evidence
 _MIN_NORMAL_CONFIDENCE = 0.1  # confidence of its normal below which a Gaussian is no receiver
 _HALF_WEIGHT = 0.02  # linear brightness of half the weight: almost black receivers show little light
-_ENCLOSED = 0.15  # share of open directions above a surface; with less it lies inside something and is left out
 _MAX_OCCLUDERS = 16000  # gaussians that block light, chosen at random and grown to cover the same area
 _OCCLUDER_OPACITY = 0.1  # opacity below which a Gaussian blocks no light
 _OCCLUDERS_WITHIN = 1.3  # radii of the region within which Gaussians block light
@@ -169,14 +168,11 @@ def find_shading_evidence(captured: CapturedScene, *, region: BoundingSphere) ->
     occluders = _occluders(scene, region)
     maps = splat_depth_maps(occluders, window, size=_MAP_SIZE, with_color=False, nearest=nearest)
     visible = visibility(maps, points, facing, bias=_BIAS * maps.texel)
-    open_ = _transported(visible, (facing @ DIRECTIONS.T).clamp_min(0)).sum(1)
     area = scene.scales[chosen].sort(1).values[:, 1:].prod(1)
     certain = scene.opacities[chosen] * normals.confidence[chosen].clamp_min(0.05)
     weights = certain * area.clamp_max(4 * float(area.median()))
     gray = colors.mean(1)
-    weights = weights * (gray / (gray + _HALF_WEIGHT)) * (open_ > _ENCLOSED)
-    if float(weights.sum()) <= 0:
-        return _nothing(region)
+    weights = weights * gray / (gray + _HALF_WEIGHT)
     # grouping by normals as well would explain shading by albedo
     features = torch.cat([_chroma_features(colors), (points - region.center) / (_POSITION_UNIT * region.radius)], 1)
     means = k_means(features, features[_chosen(len(features), _MATERIALS)], rounds=12)

@@ -1,7 +1,6 @@
 """Samples of a `Light`: directional lights with one shadow map each.
 
-A source becomes one sample, or several over its cone if it is wide. The ambient light becomes 32 samples spread evenly
-over the sphere.
+A source becomes one sample. The ambient light becomes 32 samples spread evenly over the sphere.
 """
 
 import math
@@ -11,13 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.core.directions import even_pairs, vogel_offsets
-from splatgraft.relighting.light.light import Light, LightSource
+from splatgraft.core.directions import even_pairs
+from splatgraft.relighting.light.light import Light
 
 _AMBIENT_SAMPLES = 32  # directions over the sphere, an even number; set by hand
-_SOURCE_SAMPLES = 9  # maximum number of samples of all sources together; set by hand
-_SINGLE_SOFTNESS = math.radians(8.0)
-"""Maximum softness of a source that is one sample. Measured: one filtered map is then within 0.02 of traced rays."""
 
 
 @dataclass(frozen=True)
@@ -61,59 +57,17 @@ def sample_light(light: Light) -> LightSamples:
     A source of confidence c gives the share c of its irradiance to its own samples and the rest to the ambient ones.
     Thus a source that may not exist casts a weaker shadow.
     """
-    directions, irradiance, softness, within, distances = [], [], [], [], []
-    for source, count in zip(light.sources, _sample_counts(light), strict=False):
-        rgb = torch.tensor(source.irradiance) * source.confidence / count
-        for direction in _cone_directions(source, count):
-            directions.append(direction)
-            irradiance.append(rgb)
-            within.append(source.blockers_within)
-            distances.append(source.distance)
-            softness.append(source.softness / math.sqrt(count) if count > 1 else source.softness)
-    unsure = sum((torch.tensor(s.irradiance) * (1 - s.confidence) for s in light.sources), torch.zeros(3))
+    sources = light.sources
+    rgb = torch.tensor([source.irradiance for source in sources]).reshape(-1, 3)
+    certain = torch.tensor([source.confidence for source in sources]).reshape(-1, 1)
     n = _AMBIENT_SAMPLES
     ambient = even_pairs(n)
-    radiance = light.ambient_radiance(ambient) + unsure / (4 * math.pi)
+    radiance = light.ambient_radiance(ambient) + ((1 - certain) * rgb).sum(0) / (4 * math.pi)
     return LightSamples(
-        directions=torch.cat([torch.stack(directions), ambient]) if directions else ambient,
-        irradiance=torch.cat(
-            [torch.stack(irradiance).reshape(-1, 3) if irradiance else torch.zeros(0, 3), radiance * 4 * math.pi / n]
-        ),
-        softness=torch.tensor(softness + [math.acos(1 - 2 / n)] * n),
-        is_source=(True,) * len(directions) + (False,) * n,
-        blockers_within=(*within, *(math.inf,) * n),
-        distances=torch.tensor(distances + [math.inf] * n),
+        directions=torch.cat([torch.tensor([s.direction for s in sources]).reshape(-1, 3), ambient]),
+        irradiance=torch.cat([certain * rgb, radiance * 4 * math.pi / n]),
+        softness=torch.tensor([s.softness for s in sources] + [math.acos(1 - 2 / n)] * n),
+        is_source=(True,) * len(sources) + (False,) * n,
+        blockers_within=(*(s.blockers_within for s in sources), *(math.inf,) * n),
+        distances=torch.tensor([s.distance for s in sources] + [math.inf] * n),
     )
-
-
-def main_source_samples(light: Light) -> int:
-    """Return the number of samples of the first source of `light`, which come first."""
-    return _sample_counts(light)[0] if light.sources else 0
-
-
-def _sample_counts(light: Light) -> list[int]:
-    """Divide the samples among sources, brightest first.
-
-    Every source gets one. A wide source takes all free samples, or half of them if a later source is wide, too.
-    """
-    wide = [source.softness > _SINGLE_SOFTNESS for source in light.sources[:_SOURCE_SAMPLES]]
-    free = _SOURCE_SAMPLES - len(wide)
-    counts = []
-    for i, is_wide in enumerate(wide):
-        taken = (free + 1) // 2 if any(wide[i + 1 :]) else free
-        counts.append(1 + taken if is_wide else 1)
-        free -= counts[-1] - 1
-    return counts
-
-
-def _cone_directions(source: LightSource, count: int) -> list[torch.Tensor]:
-    """Spread directions over the cone of `source` (Vogel spiral), so that the samples' own cones end at its rim."""
-    direction = torch.tensor(source.direction)
-    if count == 1:
-        return [direction]
-    j = torch.arange(count)
-    # the variances of the spiral, radius R sqrt(1 - 1/count), and of a sample, radius R / sqrt(count), sum to R^2's
-    r = ((j + 0.5) / count * (1 - 1 / count)).sqrt() * math.sin(source.softness)
-    offsets = vogel_offsets(direction, r, j)
-    offsets = offsets - offsets.mean(0)
-    return list(offsets + (1 - (offsets**2).sum(1, keepdim=True)).sqrt() * direction)

@@ -37,8 +37,6 @@ AMBIENT_SIZE = 256
 _OBJECT_BIAS = (2.0, 1.0)  # pixels, for sources and ambient light; nearer occluders are the receiver's own surface
 _SELF_BIAS = (2.5, 2.0)  # pixels, for an object's shadow on itself
 _SCENE_BIAS = (2.5, 1.5)  # pixels, for the scene's shadow on itself and on objects
-_SELF_AMBIENT = 1 / 3  # share of an ambient sample that arrives although the object itself blocks it
-_SCENE_AMBIENT = 0.5  # share of an ambient sample that arrives although the scene blocks it
 _MAX_ALBEDO = 0.8  # limit of an object's bounce under the new light: albedo of fresh snow and white paint
 
 # limits of shadow and bounce; set by hand
@@ -110,7 +108,6 @@ def self_visibility(
     window, (source_bias, ambient_bias) = maps.ambient_maps.window, _SELF_BIAS
     points = raised(gaussians, normals)
     ambient = visibility(maps.ambient_maps, points, normals, bias=ambient_bias * maps.ambient_maps.texel)
-    ambient = _SELF_AMBIENT + (1 - _SELF_AMBIENT) * ambient
     sources = samples.of_sources
     if not len(sources):
         return ambient
@@ -166,7 +163,6 @@ def scene_visibility(
     """
     source_bias, ambient_bias = _SCENE_BIAS
     ambient = visibility(maps.ambient_maps, points, normals, bias=ambient_bias * maps.ambient_maps.texel)
-    ambient = _SCENE_AMBIENT + (1 - _SCENE_AMBIENT) * ambient
     if maps.source_maps is None:
         return ambient
     of_sources = visibility(maps.source_maps, points, normals, bias=source_bias * maps.source_maps.texel)
