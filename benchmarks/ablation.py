@@ -34,6 +34,7 @@ from exam_scenes import scene_arguments, scenes_in
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting import LayerWeights, Light, Relit, relight
@@ -127,16 +128,16 @@ def past_no_scene(maps: SceneShadowMaps, points: Tensor, normals: Tensor) -> Ten
     return torch.ones(len(points), sources + len(maps.ambient_maps.first))
 
 
-def past_no_object(maps: object, gaussians: Gaussians, normals: Tensor, samples: LightSamples) -> Tensor:
+def past_no_object(gaussians: Gaussians, sphere: object, normals: Tensor, samples: LightSamples) -> Tensor:
     return torch.ones(gaussians.count, len(samples))
 
 
 def past_object(
-    maps: Any, gaussians: Gaussians, normals: Tensor, samples: LightSamples, *, sources_pass: bool
+    gaussians: Gaussians, sphere: BoundingSphere, normals: Tensor, samples: LightSamples, *, sources_pass: bool
 ) -> Tensor:
     """Return the visibility past the object, but 1 for the sources' samples, or for those of the ambient light."""
     passes = torch.tensor(samples.is_source) == sources_pass
-    return torch.where(passes, 1, self_visibility(maps, gaussians, normals, samples))
+    return torch.where(passes, 1, self_visibility(gaussians, sphere, normals, samples))
 
 
 def with_samples(function: Callable[..., Any], at: int, **values: float) -> Callable[..., Any]:
@@ -186,11 +187,11 @@ def hard_shadows(occlusion: Occlusion, samples: LightSamples, *args: Any, **more
     return occluded_irradiance(occlusion, hard, *args, **more)
 
 
-def evenly_colored(maps: DepthMaps, front: Tensor, back: Tensor, *, brightest: Tensor) -> Occlusion:
+def evenly_colored(maps: DepthMaps, front: Tensor, back: Tensor) -> Occlusion:
     """Build an object's pyramids with its mean colour on all sides."""
     mean = maps.color.sum((0, 2, 3)) / maps.alpha.sum()
     color = maps.alpha[:, None] * mean[:, None, None]
-    return occlusion_from_maps(replace(maps, color=color), front, back, brightest=brightest)
+    return occlusion_from_maps(replace(maps, color=color), front, back)
 
 
 def matt(gaussians: Gaussians, normals: Tensor, views: object, light: ReflectedLight):
@@ -308,7 +309,6 @@ ROWS: Mapping[str, Row] = {
         "bounce in the colour of the unlit side; the mean colour",
         {"relighting.shadows.scene_ratio.occlusion_from_maps": evenly_colored},
     ),
-    "bounce-limit": Row("object", "limit of the bounce", {"relighting.shadows.scene_ratio._MAX_ALBEDO": _MANY}),
     "darkest": Row(
         "shadows",
         "lower limit of shadows",
@@ -324,16 +324,6 @@ ROWS: Mapping[str, Row] = {
         "shadow of the scene on receivers, which objects do not darken again",
         {"relighting.scene_light.scene_visibility": past_no_scene},
     ),
-    "scene-ambient": Row(
-        "place", "half of the blocked ambient light passes", {"relighting.shadows.scene_ratio._SCENE_AMBIENT": 0.0}
-    ),
-    "observed-light": Row(
-        "place",
-        "visibility of the main source from brightness",
-        {"relighting.scene_light._with_observed_light": lambda gaussians, normals, light, visible: visible},
-    ),
-    "observed-groups": Row("place", "materials in it; one", {"relighting.scene_light.group_materials": one_group}),
-    "observed-median": Row("place", "median over neighbours in it", {"relighting.scene_light._SMOOTHED": 1}),
     "above-layer": Row(
         "place", "receivers lit at the layer's top; at centres", {"relighting.scene_light.above_layer": centers}
     ),
@@ -354,9 +344,6 @@ ROWS: Mapping[str, Row] = {
     "uncertainty": Row(
         "place", "softening of sources by their uncertainty", {"relighting.light.light._UNCERTAINTY_BLUR": 0.0}
     ),
-    "wide-sources": Row(
-        "place", "several samples of a wide source; one", {"relighting.light.samples._SINGLE_SOFTNESS": math.inf}
-    ),
     "lamp-distance": Row(
         "object",
         "distance of lamps",
@@ -370,9 +357,6 @@ ROWS: Mapping[str, Row] = {
     ),
     "neighbour-normals": Row(
         "object", "the neighbours' normals beside those from depth", {"relighting.object_views._NEIGHBOURS": 0.0}
-    ),
-    "depth-edges": Row(
-        "object", "windows of depth normals end at edges", {"relighting.object_views._SAME_SURFACE": _MANY}
     ),
     "mixture-normals": Row(
         "scene", "normals of mixtures of neighbours; the shortest axis", {"relighting.normals._NEIGHBOURS": 1}
@@ -418,7 +402,6 @@ ROWS: Mapping[str, Row] = {
     "level": Row("layers", "level; none of it", shading(level_share=0.0)),
     "tint-share": Row("layers", "damping of the tint; all of it", shading(tint_share=1.0)),
     "tint": Row("layers", "tint; none of it", shading(tint_share=0.0)),
-    "span": Row("layers", "limit of the variation", shading(span=_MANY)),
     "floor": Row("layers", "light added to both irradiances", shading(floor=0.0)),
     # gloss
     "gloss": Row("object", "gloss; a matt object", {"relighting.prepared_object.estimate_materials": matt}),
@@ -473,7 +456,6 @@ ROWS: Mapping[str, Row] = {
             )
         },
     ),
-    "enclosed": Row("evidence", "enclosed surfaces left out", {"relighting.light.evidence._ENCLOSED": -1.0}),
     "few-occluders": Row("evidence", "thinning of occluders", {"relighting.light.evidence._MAX_OCCLUDERS": 10**9}),
     "emitter-distance": Row(
         "radiance",

@@ -21,7 +21,6 @@ from splatgraft_paper.exam.scenes import ExamScene
 FLOORS = (0.02, 0.08, 0.2)
 LEVEL_SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 TINT_SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
-SPANS = (3.0, 5.0, 12.0)
 
 
 def gains(scene: ExamScene, choices: list[ShadeSettings]) -> list[float]:
@@ -46,8 +45,8 @@ def gains(scene: ExamScene, choices: list[ShadeSettings]) -> list[float]:
 def main() -> None:
     """Fit and print."""
     options = scene_arguments(__doc__).parse_args()
-    grid = itertools.product(SPANS, FLOORS, LEVEL_SHARES, TINT_SHARES)
-    choices = [ShadeSettings(span, floor, level, tint) for span, floor, level, tint in grid]
+    grid = itertools.product(FLOORS, LEVEL_SHARES, TINT_SHARES)
+    choices = [ShadeSettings(*chosen) for chosen in grid]
     names, rows = [], []
     for name, read in scenes_in(options):
         rows.append(gains(read(), choices))
@@ -64,7 +63,7 @@ def main() -> None:
         f"each scene by the numbers of the others: {sum(left_out) / len(left_out):+.2f} dB, worst {min(left_out):+.2f}"
     )
     today = ShadeSettings()
-    for name in ("span", "floor", "level_share", "tint_share"):
+    for name in ("floor", "level_share", "tint_share"):
         for value in sorted({getattr(choice, name) for choice in choices}):
             alike = [j for j, c in enumerate(choices) if c == replace(choices[best], **{name: value})]
             print(f"{name} {value}: {table.mean(0)[alike[0]]:+.2f} dB (today {getattr(today, name)})")

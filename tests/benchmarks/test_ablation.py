@@ -82,7 +82,7 @@ def test_a_row_that_changes_nothing_is_told_from_one_that_does(scene):
     unused = Row("layers", "a call of a stage that is not run again", ROWS["bounce"].patches)
     assert not ablation.measure(unused, baseline, full).changed
     # reusing what does not depend on the stage gives what the whole transfer gives
-    for name in ("tint-share", "lamps"):
+    for name in ("level-share", "albedo"):
         alone, reused = (
             ablation.measure(row, baseline, full) for row in (replace(ROWS[name], stage="scene"), ROWS[name])
         )

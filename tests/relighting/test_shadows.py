@@ -172,7 +172,7 @@ def test_an_even_sky_leaves_no_light_where_a_ball_touches_the_floor():
     """Return the closed form: a sphere on a plane takes R^3 / d^3 of the irradiance, d from its centre to the point."""
     light = Light(sources=(), ambient=fit_ambient(torch.full((3,), 1.0)))
     samples = sample_light(light)
-    maps = object_shadow_maps(ball(), bounding_sphere(ball()), samples)
+    maps = object_shadow_maps(ball(), bounding_sphere(ball()), samples, radiance=torch.zeros(ball().count, 3))
     away = RADIUS * torch.tensor([0.1, 0.2, 0.3, 0.5, 1.0])
     turn = torch.arange(24) / 24 * 2 * math.pi
     touching = float(CENTER[2]) - RADIUS
@@ -191,7 +191,7 @@ def test_a_light_as_wide_as_a_half_space_or_wider_gives_scene_and_object_the_sam
     """A source of 90 degrees whose direction is uncertain by 90 has a softness of 100.6 degrees."""
     samples = sample_light(from_above())
     samples = replace(samples, softness=torch.full_like(samples.softness, math.radians(degrees)))
-    maps = object_shadow_maps(ball(), bounding_sphere(ball()), samples)
+    maps = object_shadow_maps(ball(), bounding_sphere(ball()), samples, radiance=torch.zeros(ball().count, 3))
     normals = even_directions(50)
     shares = torch.ones(50, len(samples))
     sums = (light_sums(maps, 3 * normals, normals, sample_visibility=shares, sources=part) for part in (True, False))

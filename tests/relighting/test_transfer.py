@@ -12,7 +12,7 @@ from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians, concatenate, empty
-from splatgraft.core.images import LUMINANCE, linear_from_srgb
+from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.relighting import (
@@ -147,6 +147,20 @@ def test_a_red_ball_reddens_the_floor_and_no_energy_grows_without_its_bounce():
     assert relit.shadow.min() > 0
     assert relit.bounce.min() >= 0
     assert relit.ratio(LayerWeights(bounce=0.0))[~relit.is_object].max() <= 1
+
+
+def test_the_bounce_does_not_depend_on_how_bright_the_light_of_the_object_s_capture_was():
+    bounces = []
+    for brightness in (1.0, 3.0):
+        gray = float(srgb_from_linear(torch.tensor(0.1 * brightness)))
+        old = replace(sun_from(1, 0, 1), ambient=brightness * SKY)
+        old = replace(old, sources=(replace(old.sources[0], irradiance=(3 * brightness,) * 3),))
+        composite = placed((ball(rgb=(gray,) * 3), at(0.0, 0.0, 0.35)))
+        sources = [SourceScene(floor(), cameras(), light=old)]
+        relit = relight(composite, cameras(), sources=sources, light=sun_from(-1, 0, 1), options=WHOLE)
+        bounces.append(relit.bounce)
+    assert float(bounces[0].max()) > 0.02
+    torch.testing.assert_close(*bounces, rtol=1e-2, atol=1e-3)
 
 
 def test_two_objects_shadow_each_other():

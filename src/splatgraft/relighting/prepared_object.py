@@ -6,6 +6,7 @@
    scale, or a change of the light sources.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,7 +19,9 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.clock_sun import ClockSun
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.similarity import Similarity
+from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
@@ -31,6 +34,8 @@ from splatgraft.relighting.object_views import ObjectView, fuse_normals, object_
 from splatgraft.relighting.shading import irradiance
 from splatgraft.relighting.shadows.scene_ratio import ObjectShadowMaps, object_shadow_maps, self_visibility
 from splatgraft.runtime.note import Note
+
+_MAX_ALBEDO = 0.8  # albedo of fresh snow and white paint
 
 SourceLight = Light | EstimatedLight | NoLight | None
 """Light that an object was captured in: given, estimated, none found, or None without a source scene."""
@@ -101,7 +106,7 @@ class PreparedObject:
         if light.sources != self.light_sources or new.scale != old.scale or not torch.equal(new.rotation, old.rotation):
             return None
         center = self.sphere.center + (new.translation - old.translation).to(self.sphere.center)
-        window = replace(self.maps.ambient_maps.window, center=center)
+        sphere = BoundingSphere(center, self.sphere.radius)
         samples = sample_light(light)
         parts = [part for part in (samples.of_sources, samples.of_ambient) if len(part)]
         occlusions = tuple(
@@ -112,8 +117,8 @@ class PreparedObject:
             self,
             gaussians=placed.in_target(),
             target_from_object=new,
-            sphere=BoundingSphere(center, self.sphere.radius),
-            maps=ObjectShadowMaps(replace(self.maps.ambient_maps, window=window), occlusions),
+            sphere=sphere,
+            maps=ObjectShadowMaps(sphere, occlusions),
         )
 
 
@@ -158,8 +163,6 @@ def prepare_object(
     seen_from = cameras if source is None else placed.target_from_object.cameras(source.cameras)
     views = object_views(gaussians, sphere, seen_from)
     normals = _normals(placed, source, gaussians, seen_from, views)
-    samples = sample_light(light)
-    maps = object_shadow_maps(gaussians, sphere, samples)
     lighting, notes = None, []
     if isinstance(source_light, NoLight):
         notes.append(Note(f"At the old place of object {number}: {source_light.reason}"))
@@ -169,7 +172,7 @@ def prepare_object(
         described = describe_light(old, estimate_up(source.cameras)) + ("." if estimate is not None else ", as given.")
         old = old.rotated(placed.target_from_object.rotation)
         old_samples = sample_light(old)
-        shares = self_visibility(maps, gaussians, normals.vectors, old_samples)
+        shares = self_visibility(gaussians, sphere, normals.vectors, old_samples)
         received = irradiance(old_samples, normals.vectors, sample_visibility=shares)
         materials = estimate_materials(gaussians, normals.vectors, views, reflected_light(old, old_samples, shares))
         lighting = SourceLighting(old, received, materials, estimate)
@@ -177,6 +180,10 @@ def prepare_object(
     if lighting is None:
         unknown = f"The old light of object {number} is unknown: the object keeps its mean brightness."
         notes.append(Note(unknown, "warning"))
+    samples = sample_light(light)
+    visible = self_visibility(gaussians, sphere, normals.vectors, samples)
+    received = irradiance(samples, normals.vectors, sample_visibility=visible)
+    radiance = _albedo(gaussians, lighting) * received / math.pi
     return PreparedObject(
         number=number,
         gaussians=gaussians,
@@ -184,11 +191,19 @@ def prepare_object(
         sphere=sphere,
         normals=normals,
         light_sources=light.sources,
-        maps=maps,
-        self_visibility=self_visibility(maps, gaussians, normals.vectors, samples),
+        maps=object_shadow_maps(gaussians, sphere, samples, radiance=radiance),
+        self_visibility=visible,
         source_lighting=lighting,
         notes=tuple(notes),
     )
+
+
+def _albedo(gaussians: Gaussians, lighting: SourceLighting | None) -> Float[Tensor, "n 3"]:
+    """Compute the share of light that the Gaussians reflect: their colour if the old light is unknown."""
+    linear = linear_from_srgb(rgb_from_dc(gaussians.sh[:, 0]).clamp(0, 1))
+    if lighting is not None:
+        linear = math.pi * linear / lighting.irradiance.clamp_min(1e-6)
+    return linear.clamp_max(_MAX_ALBEDO)
 
 
 def _gloss_note(materials: Materials, gaussians: Gaussians) -> str:

@@ -49,9 +49,7 @@ class Occlusion:
     """Width of the finest level, pixels."""
 
 
-def occlusion_from_maps(
-    maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tensor, "k"], *, brightest: Float[Tensor, "k 3"]
-) -> Occlusion:
+def occlusion_from_maps(maps: DepthMaps, front: Int[Tensor, "k"], back: Int[Tensor, "k"]) -> Occlusion:
     """Build mip pyramids from an object's depth maps.
 
     Args:
@@ -59,7 +57,6 @@ def occlusion_from_maps(
         front: Position in `maps` of each sample's map.
         back: Position of the map from the opposite direction, which shows the unlit side (mirrored in u, depth
             negated).
-        brightest: Upper limit of the unlit side's linear rgb radiance.
     """
     alpha = maps.alpha[front]
     first = torch.where(maps.first < float(FAR) / 2, maps.first, maps.mean)
@@ -67,7 +64,6 @@ def occlusion_from_maps(
     far_side = torch.maximum(-first[back].flip(2), lit_side)
     planes = [alpha, alpha * lit_side, alpha * 0.5 * (lit_side + far_side)]
     unlit = (maps.color[back] / maps.alpha[back][:, None].clamp_min(1e-3)).flip(3)
-    unlit = torch.minimum(unlit, brightest[:, :, None, None])
     planes += [alpha * unlit[:, channel] for channel in range(3)]
     level = torch.stack(planes, 1)
     levels = []

@@ -120,7 +120,7 @@ def shade_receivers(
 
 def _broad(gaussians: Gaussians, maps: ObjectShadowMaps) -> Bool[Tensor, "m"]:
     """Select Gaussians so wide that ambient light may vary over them."""
-    return gaussians.scales.max(1).values > _BROAD * maps.ambient_maps.window.radius
+    return gaussians.scales.max(1).values > _BROAD * maps.sphere.radius
 
 
 def _varying_ratio(
@@ -133,7 +133,7 @@ def _varying_ratio(
     g = receivers.gaussians
     by_sources = _sums(receivers, maps, sources=True)
     ratio, variation = ratio_from_sums(by_sources + ambient), torch.zeros(g.count, 3)
-    smallest = _FINEST * maps.ambient_maps.window.radius / math.sqrt(PIECE_WIDTH)
+    smallest = _FINEST * maps.sphere.radius / math.sqrt(PIECE_WIDTH)
     broad = _broad(g, maps)
     fine = ((g.scales.max(1).values > smallest) & ~broad).nonzero()[:, 0]
     lit = bool(by_sources.any())

@@ -8,7 +8,7 @@ Differential rendering (Debevec 1998): the ratio of irradiance with the object t
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,7 +19,6 @@ from splatgraft.core.directions import frames_along
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.relighting.light.samples import LightSamples
 from splatgraft.relighting.normals import raised
-from splatgraft.relighting.shading import irradiance
 from splatgraft.relighting.shadows.occlusion import Occlusion, occluded_irradiance, occlusion_from_maps
 from splatgraft.relighting.shadows.shadow_maps import (
     DepthMaps,
@@ -35,9 +34,9 @@ _SOURCE_SIZE = 512  # pixels, a multiple of 16; width of a source sample's map
 AMBIENT_SIZE = 256
 """Width of an ambient sample's map, pixels, a multiple of 16."""
 _OBJECT_BIAS = (2.0, 1.0)  # pixels, for sources and ambient light; nearer occluders are the receiver's own surface
-_SELF_BIAS = (2.5, 2.0)  # pixels, for an object's shadow on itself
+_SELF_BIAS = 2.5  # pixels, for an object's shadow on itself
 _SCENE_BIAS = (2.5, 1.5)  # pixels, for the scene's shadow on itself and on objects
-_MAX_ALBEDO = 0.8  # limit of an object's bounce under the new light: albedo of fresh snow and white paint
+_SELF_AMBIENT = 1 / 3  # share of an ambient sample that arrives although the object itself blocks it: interreflection
 
 # limits of shadow and bounce; set by hand
 _MIN_CHANGE = 0.004  # share of light; half an 8-bit step of a mid grey. Smaller changes become 0
@@ -49,29 +48,27 @@ DARKEST = 0.04
 class ObjectShadowMaps:
     """An object's depth maps from all samples of a light."""
 
-    ambient_maps: DepthMaps
-    """Depth maps, one per ambient sample."""
+    sphere: BoundingSphere
+    """The object's bounding sphere."""
     occlusions: tuple[tuple[LightSamples, Occlusion, float], ...]
     """Samples, occlusion, and bias in world units: of the sources, if there are any, then of the ambient light."""
 
 
-def object_shadow_maps(gaussians: Gaussians, sphere: BoundingSphere, samples: LightSamples) -> ObjectShadowMaps:
+def object_shadow_maps(
+    gaussians: Gaussians, sphere: BoundingSphere, samples: LightSamples, *, radiance: Float[Tensor, "n 3"]
+) -> ObjectShadowMaps:
     """Splat depth maps of an object for every light sample, with its colours for the bounce.
 
     Args:
         gaussians: The object, target's frame.
         sphere: The object's bounding sphere, which the maps cover.
         samples: Samples of the light at the object's place.
+        radiance: Linear rgb that the Gaussians reflect in that light.
     """
-    occluders = occluders_of(gaussians)
+    occluders = replace(occluders_of(gaussians), linear_rgb=radiance)
     sources, ambient = samples.of_sources, samples.of_ambient
     source_bias, ambient_bias = _OBJECT_BIAS
     occlusions = []
-
-    def unlit(part: LightSamples) -> Float[Tensor, "k 3"]:
-        facing = irradiance(samples, -part.directions, sample_visibility=torch.ones(len(part), len(samples)))
-        return _MAX_ALBEDO * facing / math.pi
-
     if len(sources):
         both = torch.cat([sources.directions, -sources.directions])
         nearness = 1 / sources.distances.clamp_min(1.5 * sphere.radius)  # a nearer source counts as this far
@@ -80,40 +77,35 @@ def object_shadow_maps(gaussians: Gaussians, sphere: BoundingSphere, samples: Li
         window = Window(sphere.center, rim, frames_along(both), torch.cat([nearness, -nearness]))
         maps = splat_depth_maps(occluders, window, size=_SOURCE_SIZE, with_color=True)
         front = torch.arange(len(sources))
-        occlusion = occlusion_from_maps(maps, front, front + len(front), brightest=unlit(sources))
+        occlusion = occlusion_from_maps(maps, front, front + len(front))
         occlusions.append((sources, occlusion, source_bias * maps.texel))
     window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(ambient.directions))
     maps = splat_depth_maps(occluders, window, size=AMBIENT_SIZE, with_color=True)
     front = torch.arange(len(ambient))
     back = (front + len(front) // 2) % len(front)
-    occlusion = occlusion_from_maps(maps, front, back, brightest=unlit(ambient))
-    occlusions.append((ambient, occlusion, ambient_bias * maps.texel))
-    return ObjectShadowMaps(maps, tuple(occlusions))
+    occlusions.append((ambient, occlusion_from_maps(maps, front, back), ambient_bias * maps.texel))
+    return ObjectShadowMaps(sphere, tuple(occlusions))
 
 
 def self_visibility(
-    maps: ObjectShadowMaps, gaussians: Gaussians, normals: Float[Tensor, "m 3"], samples: LightSamples
+    gaussians: Gaussians, sphere: BoundingSphere, normals: Float[Tensor, "m 3"], samples: LightSamples
 ) -> Float[Tensor, "m k"]:
-    """Look up the visibility of every light sample from an object's own Gaussians, past the object itself.
+    """Compute the visibility of every light sample from an object's own Gaussians, past the object itself.
 
     Args:
-        maps: The object's shadow maps.
-        gaussians: The m Gaussians that receive light.
+        gaussians: The m Gaussians of the object.
+        sphere: The object's bounding sphere.
         normals: Unit normals of their surfaces.
-        samples: k samples of any light, because maps of its sources are made anew here.
+        samples: k samples of a light.
 
     Returns:
         Share of each sample that arrives, in [0, 1].
     """
-    window, (source_bias, ambient_bias) = maps.ambient_maps.window, _SELF_BIAS
-    points = raised(gaussians, normals)
-    ambient = visibility(maps.ambient_maps, points, normals, bias=ambient_bias * maps.ambient_maps.texel)
-    sources = samples.of_sources
-    if not len(sources):
-        return ambient
-    lit = Window(center=window.center, radius=window.radius, frames=frames_along(sources.directions))
-    fronts = splat_depth_maps(occluders_of(gaussians), lit, size=AMBIENT_SIZE, with_color=False)
-    return torch.cat([visibility(fronts, points, normals, bias=source_bias * fronts.texel), ambient], 1)
+    window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(samples.directions))
+    maps = splat_depth_maps(occluders_of(gaussians), window, size=AMBIENT_SIZE, with_color=False)
+    visible = visibility(maps, raised(gaussians, normals), normals, bias=_SELF_BIAS * maps.texel)
+    passing = torch.where(torch.tensor(samples.is_source), 0.0, _SELF_AMBIENT)
+    return passing + (1 - passing) * visible
 
 
 @dataclass(frozen=True)
