@@ -9,16 +9,16 @@ from functools import cache
 
 import pytest
 import torch
-from shapes import ring, surfels
+from shapes import UP, ring, surfels
 
 from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.similarity import Similarity
-from splatgraft.relighting import Light, LightSource, RelightOptions, relight
+from splatgraft.relighting import Light, LightSource, RelightOptions, SourceScene, relight
 from splatgraft.relighting.layers import pasted
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.relighting.light.samples import sample_light
@@ -184,6 +184,69 @@ def test_an_even_sky_leaves_no_light_where_a_ball_touches_the_floor():
     truth = 1 - (1 + (away / RADIUS) ** 2) ** -1.5
     # 32 directions stand for the whole sky, so a cone of 0.35 rad covers a part of its rim only; and `darkest` remains
     torch.testing.assert_close(found, truth, rtol=0, atol=0.05)
+
+
+def cloth(rough: float) -> Gaussians:
+    """Return a dark cloth at z = 0 whose albedo varies from thread to thread; its layer is `rough` thick."""
+    generator = torch.Generator().manual_seed(3)
+    place = (torch.rand(14_000, 2, generator=generator) - 0.5) * 4
+    height = rough * torch.randn(14_000, 1, generator=generator)
+    gray = srgb_from_linear(0.03 * torch.exp(0.5 * torch.randn(14_000, 1, generator=generator)))
+    up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(14_000, 1)
+    return surfels(torch.cat([place, height], 1), up, width=0.03, thickness=0.003, srgb=gray.repeat(1, 3))
+
+
+def can(gray: float, *, radius: float, height: float) -> Gaussians:
+    """Return a closed cylinder that stands on z = 0."""
+    around, up = torch.arange(80) / 80 * 2 * math.pi, torch.linspace(0.01, height, 40)
+    turn, z = (t.flatten() for t in torch.meshgrid(around, up, indexing="ij"))
+    out = torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], 1)
+    side = torch.linspace(-radius, radius, 25)
+    disc = torch.stack(torch.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
+    disc = disc[disc.norm(dim=1) < radius]
+    points, normals = [radius * out + z[:, None] * UP], [out]
+    for at, facing in ((height, 1.0), (0.005, -1.0)):
+        points.append(torch.cat([disc, torch.full((len(disc), 1), at)], 1))
+        normals.append((facing * UP).repeat(len(disc), 1))
+    return surfels(torch.cat(points), torch.cat(normals), width=0.02, srgb=gray)
+
+
+def light_beside_a_can(away: float, *, albedo: float, radius: float, height: float) -> float:
+    """Return the share of an even light that arrives on the ground `away` from the axis, by rays."""
+    u = torch.rand(20_000, 2, generator=torch.Generator().manual_seed(0))
+    turn, sine = 2 * math.pi * u[:, 0], u[:, 1].sqrt()  # by cosine
+    along, x, z = sine**2, sine * turn.cos() * away, (1 - u[:, 1]).sqrt()
+    root = x**2 - along * (away**2 - radius**2)
+    to_wall = (-x - root.clamp_min(0).sqrt()) / along
+    hidden = float(((root > 0) & (to_wall > 0) & (to_wall * z < height)).float().mean())
+    # the wall, which gets the same even light, is as bright as its albedo
+    return 1 - hidden * (1 - albedo)
+
+
+@pytest.mark.parametrize("rough", [0.0, 0.05])
+@pytest.mark.parametrize(("gray", "albedo"), [(0.35, 0.2), (0.8, 0.8)])
+def test_even_light_shades_dark_textured_cloth_at_the_foot_of_a_can(rough, gray, albedo):
+    even, shape = Light(sources=(), ambient=fit_ambient(torch.full((3,), 0.5))), {"radius": 0.25, "height": 0.6}
+    target, placed = cloth(rough), (PlacedObject(can(gray, **shape), IDENTITY),)
+    composite = Composite(target, placed, torch.zeros(target.count, dtype=torch.bool))
+    relit = relight(composite, cameras(), sources=[SourceScene(target, cameras(), light=even)], light=even)
+    away = torch.tensor([0.27, 0.32, 0.37, 0.42, 0.47])
+    found = []
+    for camera in cameras()[::3]:
+        eye = camera.centers[0]
+        turn = torch.atan2(eye[1], eye[0]) + torch.linspace(-1, 1, 60)
+        around = torch.stack([turn.cos(), turn.sin(), torch.zeros(60)], 1)
+        pixels = camera.project(away[:, None, None] * around)[0].long()
+        after, before = (
+            linear_from_srgb(render(scene, camera).color[0].clamp(0, 1)).mean(-1)[pixels[..., 1], pixels[..., 0]]
+            for scene in (relit.bake()[0], composite.bake()[0])
+        )
+        found.append((after / before).median(1).values)
+    found = torch.stack(found).mean(0).tolist()
+    truth = [light_beside_a_can(d, albedo=albedo, **shape) for d in away.tolist()]
+    # a rough layer blurs the innermost ring, two centimetres from a wall of 25 and half as wide as the layer
+    assert found[0] == pytest.approx(truth[0], abs=0.1)
+    assert found[1:] == pytest.approx(truth[1:], abs=0.03)
 
 
 @pytest.mark.parametrize("degrees", [60.0, 90.0, 100.6])
