@@ -1,17 +1,22 @@
 """Count over rendered scenes with known light how often shadows show the right sun, for each candidate bar.
 
-    python benchmarks/fit_sun.py SCENES [SCENES ...] --work FOLDER [FOLDER ...]
+    python benchmarks/fit_sun.py SCENES [SCENES ...] --work FOLDER [FOLDER ...] [--plot FILE.svg]
 
 SCENES are folders of scenes that `splatgraft paper exam` rendered; both places of each count. A sun is right if it lies
 within 5 degrees of the disc of a true source. The source must give a fifth of the irradiance on the surface or more.
+
+The plot has one point for each place: the largest log likelihood of a direction within 15 degrees of such a source, and
+of any other direction.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from exam_scenes import scene_arguments, scenes_in
+from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import Cameras
@@ -20,12 +25,13 @@ from splatgraft.core.images import LUMINANCE
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.estimate import region_around
 from splatgraft.relighting.light.light import Light
-from splatgraft.relighting.light.sun import Sun, find_sun
+from splatgraft.relighting.light.sun import _DECISIVE, _DIRECTIONS, Sun, _ShadowEvidence, find_sun
 from splatgraft_paper.exam.scenes import ExamScene
 
 _BARS = (15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0)
 _NEAR_DEG = 5.0
 _STRONG = 0.2
+_APART = math.cos(math.radians(15))
 
 
 @dataclass(frozen=True)
@@ -52,16 +58,76 @@ class Judged:
 
 def judge(sun: Sun, truth: Light) -> Judged:
     """Compare a sun with the true light at its place."""
-    whole, off, near = float(truth.irradiance(sun.normal[None])[0] @ LUMINANCE), math.inf, 0.0
-    for source in truth.sources:
+    off, near = math.inf, 0.0
+    for source, share in zip(truth.sources, _shares(truth, sun.normal), strict=True):
         direction = torch.tensor(source.direction)
-        share = max(0.0, float(direction @ sun.normal)) * source.luminance / whole
         angle = math.degrees(math.acos(max(-1.0, min(1.0, float(direction @ sun.direction)))))
         if share > _STRONG:
             off = min(off, max(0.0, angle - source.angular_radius_deg))
         if angle < 20:
             near += share
     return Judged(sun, off, near / (1 - near))
+
+
+def _shares(truth: Light, normal: Tensor) -> list[float]:
+    """Return the share of each source in the irradiance on a surface."""
+    whole = float(truth.irradiance(normal[None])[0] @ LUMINANCE)
+    return [max(0.0, float(torch.tensor(s.direction) @ normal)) * s.luminance / whole for s in truth.sources]
+
+
+def right_and_wrong(captured: CapturedScene, region: BoundingSphere, truth: Light) -> tuple[float | None, float] | None:
+    """Return the largest log likelihoods of directions near a strong source, and of all others.
+
+    The first is None without a strong source. Without a surface, the result is None.
+    """
+    shown = _ShadowEvidence.of(captured, region)
+    if shown is None:
+        return None
+    directions = shown.above(_DIRECTIONS)
+    shares = _shares(truth, shown.surface.plane.normal)
+    strong = [s.direction for s, share in zip(truth.sources, shares, strict=True) if share > _STRONG]
+    near = (directions @ torch.tensor(strong).reshape(-1, 3).T > _APART).any(1)
+
+    def best(which: Tensor) -> float:
+        found = shown.best(directions[which], lambda these: torch.zeros(len(these)))[1] if bool(which.any()) else 0.0
+        return max(found, 0.0)
+
+    return best(near) if strong else None, best(~near)
+
+
+def plot(points: Sequence[tuple[float | None, float]], path: Path) -> None:
+    """Draw the likelihoods of all places as SVG; places without a strong source are crosses on the left."""
+    most, size, edge = 10 * math.ceil(max(max(right or 0, wrong) for right, wrong in points) / 10), 300, 50
+    scale = size / math.sqrt(most)  # square roots spread small values
+
+    def at(right: float, wrong: float) -> tuple[float, float]:
+        return edge + scale * math.sqrt(right), edge + size - scale * math.sqrt(wrong)
+
+    bar_x, bar_y = at(_DECISIVE, _DECISIVE)
+    style = 'font-family="sans-serif" font-size="12" fill="#444"'
+    marks = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size + 2 * edge} {size + 2 * edge}">',
+        f'<rect width="{size + 2 * edge}" height="{size + 2 * edge}" fill="white"/>',
+        f'<path d="M{edge} {edge}v{size}h{size}" fill="none" stroke="#444"/>',
+        f'<path d="M{edge} {edge + size}L{edge + size} {edge}" stroke="#bbb"/>',
+        f'<path d="M{edge} {bar_y:.1f}h{size}M{bar_x:.1f} {edge}v{size}" stroke="#c33" stroke-dasharray="4 4"/>',
+    ]
+    for tick in (1, 10, _DECISIVE, *range(100, most + 1, 100)):
+        x, y = at(tick, tick)
+        marks.append(f'<text x="{x:.1f}" y="{edge + size + 16}" text-anchor="middle" {style}>{tick:.0f}</text>')
+        marks.append(f'<text x="{edge - 6}" y="{y + 4:.1f}" text-anchor="end" {style}>{tick:.0f}</text>')
+    title = f'<text x="{edge + size / 2}" y="{edge + size + 36}" text-anchor="middle" {style}>'
+    marks.append(f"{title}log likelihood near a strong source</text>")
+    middle = edge + size / 2
+    turned = f'transform="rotate(-90 14 {middle})" text-anchor="middle" {style}'
+    marks.append(f'<text x="14" y="{middle}" {turned}>of the best other direction</text>')
+    for right, wrong in points:
+        x, y = at(right or 0, wrong)
+        if right is None:
+            marks.append(f'<path d="M{x - 4:.1f} {y - 4:.1f}l8 8m0 -8l-8 8" stroke="#888" stroke-width="1.5"/>')
+        else:
+            marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="#2673b8" fill-opacity="0.7"/>')
+    path.write_text("\n".join([*marks, "</svg>"]) + "\n")
 
 
 def places_of(scene: ExamScene) -> Iterator[tuple[str, Gaussians, Cameras, BoundingSphere, Light]]:
@@ -74,22 +140,33 @@ def places_of(scene: ExamScene) -> Iterator[tuple[str, Gaussians, Cameras, Bound
 
 def main() -> None:
     """Judge and print."""
-    found: list[Judged] = []
+    parser = scene_arguments(__doc__)
+    parser.add_argument("--plot", type=Path, help="SVG of the likelihoods of right and wrong directions")
+    options = parser.parse_args()
+    found, points = list[Judged](), list[tuple[float | None, float]]()
     places = 0
-    for name, read in scenes_in(scene_arguments(__doc__).parse_args()):
+    for name, read in scenes_in(options):
         for suffix, whole, cameras, place, truth in places_of(read()):
             places += 1
-            sun = find_sun(CapturedScene(whole, cameras), region_around(place, cameras), decisive=min(_BARS))
+            captured, region = CapturedScene(whole, cameras), region_around(place, cameras)
+            compared = right_and_wrong(captured, region, truth) if options.plot else None
+            if compared is not None:
+                points.append(compared)
+                right = "-" if compared[0] is None else f"{compared[0]:.0f}"
+                print(f"{name + suffix:28s} near a strong source {right}, elsewhere {compared[1]:.0f}", flush=True)
+            sun = find_sun(captured, region, decisive=min(_BARS))
             if sun is None:
                 continue
             one = judge(sun, truth)
             found.append(one)
             where = f"{name + suffix:28s} evidence {sun.evidence:4.0f}   off {one.off_deg:5.1f} degrees"
             print(f"{where}   strength {one.ratio:.2f} (true {one.true_ratio:.2f})", flush=True)
+    if points:
+        plot(points, options.plot)
     print(f"{places} places")
     for bar in _BARS:
         over = [one for one in found if one.sun.evidence >= bar]
-        logs = sorted(abs(math.log(one.ratio / one.true_ratio)) for one in over if one.is_right)
+        logs = sorted(abs(math.log(one.ratio / one.true_ratio)) for one in over if one.is_right and one.true_ratio > 0)
         error = f", median error of the strength a factor of {math.exp(logs[len(logs) // 2]):.2f}" if logs else ""
         print(f"bar {bar:3.0f}: {sum(one.is_right for one in over)} right of {len(over)}{error}")
 
