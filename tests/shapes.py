@@ -1,6 +1,7 @@
 """Flat Gaussians on surfaces of known geometry, and cameras around them, for tests in closed form."""
 
 import math
+from dataclasses import fields
 
 import torch
 from torch import Tensor
@@ -33,6 +34,24 @@ def surfels(
         opacity_logits=torch.full((n,), 3.0),
         sh=dc_from_rgb(torch.as_tensor(srgb).expand(n, 3))[:, None].clone(),
     )
+
+
+def blobs(
+    points: Tensor, width: float, *, srgb: Tensor | tuple[float, float, float] | float = 0.5, opacity_logit: float = 3.0
+) -> Gaussians:
+    """Return round Gaussians of standard deviation `width`, whose own shape tells no normal."""
+    n = len(points)
+    return Gaussians(
+        means=points,
+        log_scales=torch.full((n, 3), math.log(width)),
+        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        opacity_logits=torch.full((n,), opacity_logit),
+        sh=dc_from_rgb(torch.as_tensor(srgb).expand(n, 3))[:, None].clone(),
+    )
+
+
+def same_bits(one: Gaussians, other: Gaussians) -> bool:
+    return all(torch.equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(Gaussians))
 
 
 def ring(

@@ -7,6 +7,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import shapes
 import torch
 
 from splatgraft.cli import main
@@ -45,14 +46,8 @@ frames = 3
 
 def blobs(means: torch.Tensor, color: tuple[float, float, float], size: float) -> Gaussians:
     n = len(means)
-    shade = (torch.tensor(color) - 0.5) / 0.28209479
-    return Gaussians(
-        means=means,
-        log_scales=torch.full((n, 3), size).log(),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        opacity_logits=torch.full((n,), 3.0),
-        sh=shade.repeat(n, 1)[:, None] + 0.2 * torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(n)),
-    )
+    even = shapes.blobs(means, size, srgb=color)
+    return replace(even, sh=even.sh + 0.2 * torch.rand(n, 1, 3, generator=torch.Generator().manual_seed(n)))
 
 
 def plane(color: tuple[float, float, float]) -> Gaussians:

@@ -29,13 +29,6 @@ def test_every_part_runs_at_toy_size(name, tmp_path):
     assert not gpu.is_finished(tmp_path / f"{name}.json", toy=False)
 
 
-def test_the_two_rasterisers_agree_with_each_other_where_both_are_the_cpus():
-    (row,) = gpu.renderer(TOY)
-    assert row["picture_rmse"] == row["gradient_error_sh"] == 0
-    # float32 sums in two orders
-    assert row["adjoint_error"] < 1e-5
-
-
 def test_finished_parts_are_kept_failures_are_said_and_all_is_in_one_table(tmp_path):
     done = {"part": "renderer", "toy": True, "seconds": 1.0, "rows": [{"gaussians": 300, "forward_ms": 1.25}]}
     (tmp_path / "renderer.json").write_text(json.dumps(done))

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta, timezone
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.rotations import rotation_about
 from splatgraft.core.solar_position import solar_position
 from splatgraft.folders.capture_files import description_files
-from splatgraft.folders.clock_sun import clock_sun_path, read_clock_sun
+from splatgraft.folders.clock_sun import clock_sun_path, read_clock_sun, write_clock_sun
 from splatgraft.formats import read_cameras, write_capture
 from splatgraft.formats.captures.exif import read_geotag
 
@@ -382,15 +382,14 @@ def test_photos_of_several_days_give_no_sun_and_it_is_said(outdoors: Path, capsy
         ('"candidates"', '"c"', "expected an object with a list of candidates"),
     ],
 )
-def test_a_damaged_file_is_named(
-    old: str, new: str, message: str, outdoors: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = outdoors.parent / "out"
-    assert main(["capture", str(outdoors), "--out", str(out)]) == 0
-    path = clock_sun_path(out)
+def test_a_damaged_file_is_named(old: str, new: str, message: str, tmp_path: Path) -> None:
+    local = [replace(tag, gps_time=NOON.astimezone(timezone(timedelta(hours=-4)))) for tag in geotags(orbit, 14, OHIO)]
+    write_clock_sun(tmp_path, found(local, cameras_on(orbit, 14)))
+    path = clock_sun_path(tmp_path)
+    assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
     with pytest.raises(ValueError, match=message) as error:
-        read_clock_sun(out)
+        read_clock_sun(tmp_path)
     assert str(error.value).startswith(str(path))
 
 

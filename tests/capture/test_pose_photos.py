@@ -44,6 +44,12 @@ def photo_paths(folder, count):
     return PhotoFiles(tuple(paths))
 
 
+def left_half(folder):
+    """Write a mask of the left half of a photo."""
+    write_image(folder / "mask.png", (torch.arange(40) < 20).float().expand(30, 40))
+    return folder / "mask.png"
+
+
 def circle(count, height=1.0):
     angle = torch.arange(count) * (2 * math.pi / max(count, 1))
     eye = torch.stack([2 * angle.cos(), 2 * angle.sin(), height + 0.2 * (3 * angle).sin()], -1)
@@ -119,11 +125,8 @@ def test_what_a_pass_posed_is_a_result_and_more_is_offered_with_its_time(tmp_pat
 
 def test_a_full_quick_model_needs_no_second_effort_and_masks_are_undistorted_like_photos(tmp_path, answer):
     left = answer(model_of(3, 3), model_of(3, 3))
-    photos = photo_paths(tmp_path / "photos", 3)
-    mask = torch.zeros(30, 40, 3)
-    mask[:, :20] = 1
-    write_image(tmp_path / "mask.png", mask)
-    posed, _ = pose(replace(photos, masks=(None, tmp_path / "mask.png", None)), tmp_path)
+    photos, mask = photo_paths(tmp_path / "photos", 3), left_half(tmp_path)
+    posed, _ = pose(replace(photos, masks=(None, mask, None)), tmp_path)
     assert len(left) == 1
     assert [path and path.relative_to(tmp_path).as_posix() for path in posed.mask_paths] == [None, "masks/01.png", None]
     carried = posed.mask(1)
@@ -138,12 +141,8 @@ def test_photos_on_their_side_are_turned_with_their_masks_and_that_is_said(tmp_p
     upright_ones = pinhole(circle(count), 50.0, width=40, height=30)
     lying = upright_ones.turned(torch.ones(count, dtype=torch.long))
     answer(colmap_answer([f"{i:02d}.jpg" for i in range(count)], lying.world_from_camera, (40, 30)))
-    photos = photo_paths(tmp_path / "photos", count)
-    mask = torch.zeros(30, 40, 3)
-    mask[:, :20] = 1
-    write_image(tmp_path / "mask.png", mask)
-    said = []
-    masks = (tmp_path / "mask.png", *[None] * (count - 1))
+    photos, said = photo_paths(tmp_path / "photos", count), []
+    masks = (left_half(tmp_path), *[None] * (count - 1))
     posed, _ = pose(replace(photos, masks=masks), tmp_path, say=said.append)
     assert posed.cameras.sizes.tolist() == [[30, 40]] * count
     # clockwise: the left side is now on top

@@ -4,23 +4,13 @@ import math
 
 import pytest
 import torch
+from shapes import blobs
 
 from splatgraft.capture import VirtualCameraOptions, place_virtual_cameras
 from splatgraft.capture.virtual_cameras import dense_part, estimate_scene_up
 from splatgraft.core.capture_orientation import estimate_up, focus_point
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.rendering import render
-
-
-def blobs(means: torch.Tensor, size: float = 0.05) -> Gaussians:
-    n = len(means)
-    return Gaussians(
-        means=means,
-        log_scales=torch.full((n, 3), size).log(),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        opacity_logits=torch.full((n,), 4.0),
-        sh=torch.zeros(n, 1, 3),
-    )
 
 
 def table(seed: int = 0) -> torch.Tensor:
@@ -59,7 +49,7 @@ def test_up_is_the_side_on_which_things_stand(angle: float) -> None:
 
 
 def test_cameras_go_round_the_dense_part_upright_and_see_it() -> None:
-    scene = blobs(table())
+    scene = blobs(table(), 0.05)
     found, _ = place_virtual_cameras(scene, VirtualCameraOptions(views=12))
     centre, radius = dense_part(scene.means)
     assert torch.allclose(focus_point(found.cameras), centre, atol=1e-3 * radius)  # float32 lines through one point
@@ -71,10 +61,11 @@ def test_cameras_go_round_the_dense_part_upright_and_see_it() -> None:
 def test_a_wall_is_not_looked_at_from_behind() -> None:
     y, z = torch.meshgrid(torch.linspace(-4, 4, 60), torch.linspace(-1, 6, 50), indexing="ij")
     wall = blobs(torch.stack([torch.full_like(y, 1.0), y, z], -1).reshape(-1, 3), 0.1)
-    scene = concatenate([blobs(torch.cat([table()[:2800]] * 3)), wall])
+    subject = blobs(torch.cat([table()[:2800]] * 3), 0.05)
+    scene = concatenate([subject, wall])
     options = VirtualCameraOptions(views=16, up=(0.0, 0.0, 1.0))
     found, report = place_virtual_cameras(scene, options)
-    open_side, _ = place_virtual_cameras(blobs(torch.cat([table()[:2800]] * 3)), options)
+    open_side, _ = place_virtual_cameras(subject, options)
     assert bool((open_side.cameras.centers[:, 0] > 1.0).any())
     assert not bool((found.cameras.centers[:, 0] > 1.0).any())
     assert any("as given" in note.text for note in report)
@@ -99,12 +90,12 @@ def test_a_room_is_seen_from_within_on_request_and_reported_as_hollow() -> None:
     assert float(forward[:, :2].mean(0).norm()) < 0.05
     assert float(forward[:, 2].mean()) < 0
     assert not any(
-        "hollow" in note.text for note in place_virtual_cameras(blobs(table()), VirtualCameraOptions(views=8))[1]
+        "hollow" in note.text for note in place_virtual_cameras(blobs(table(), 0.05), VirtualCameraOptions(views=8))[1]
     )
 
 
 def test_a_scene_that_shows_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 20 solid"):
-        place_virtual_cameras(blobs(table()[:10]), VirtualCameraOptions())
+        place_virtual_cameras(blobs(table()[:10], 0.05), VirtualCameraOptions())
     with pytest.raises(ValueError, match="expected a direction"):
         VirtualCameraOptions(up=(0.0, 0.0, 0.0))

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from shapes import blobs
 
 from splatgraft import formats
 from splatgraft.cli import main
@@ -55,13 +56,7 @@ def table(n: int = 3000) -> Gaussians:
     g = torch.Generator().manual_seed(0)
     means = torch.rand(n, 3, generator=g) * torch.tensor([4.0, 0.1, 2.0])
     means[: n // 4] = torch.rand(n // 4, 3, generator=g) * torch.tensor([0.3, -2.0, 0.4]) + torch.tensor([0.5, 0, 0.2])
-    return Gaussians(
-        means=means,
-        log_scales=torch.full((n, 3), -4.0),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4).clone(),
-        opacity_logits=torch.zeros(n),
-        sh=torch.zeros(n, 1, 3),
-    )
+    return blobs(means, 0.02)
 
 
 def test_a_scene_that_lies_elsewhere_than_its_capture_is_said_to_with_the_axes_in_which_it_would_fit():

@@ -254,48 +254,7 @@ def test_a_killed_process_leaves_earlier_results_whole_and_the_next_run_finishes
     assert {folder: contents(folder) for folder in wanted} == wanted
 
 
-HANGS_AT_A_CHECKPOINT = """
-import os, sys, time
-import splatgraft.consolidation.color_fit as color_fit, splatgraft.fitting.gaussian_fit as fit
-from splatgraft.cli import main
-
-fit._CHECKPOINT_SECONDS, color_fit._SAVE_EVERY = 0.0, 8
-replace, written = os.replace, []
-
-def counted(old, new):
-    replace(old, new)
-    written.append(new)
-    # the first names the job
-    if sum(".checkpoint" in str(path) for path in written) > 3:
-        print("inside", flush=True)
-        time.sleep(3600)
-
-os.replace = counted
-main(sys.argv[1:])
-"""
 """Program that runs `splatgraft` with frequent checkpoints, and sleeps forever after the third."""
-
-
-@pytest.mark.long
-def test_each_long_step_goes_on_from_its_checkpoint_after_a_kill_inside_of_it(project: Path) -> None:
-    # posing photos is another process, which test_colmap_process.py kills
-    assert main(["run", str(project), "--to", "harmonize"]) == 0
-    flow = read_flow(project)
-    for name in ("source/reconstruct", "harmonize"):
-        step = flow.steps[name]
-        wanted = contents(step.out)
-        shutil.rmtree(step.out)
-        words = [sys.executable, "-c", HANGS_AT_A_CHECKPOINT, "run", str(project), "--to", name]
-        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as run:
-            assert run.stdout is not None
-            assert run.stdout.readline() == "inside\n"
-            run.kill()
-        kept = FolderCheckpoint(job_of(step))
-        state = kept.load()
-        assert any(kept.folder.glob("images/*.png")) if state is None else 0 < state["iteration"] < 40
-        assert main(["run", str(project), "--to", name]) == 0
-        assert contents(step.out) == wanted
-        assert not kept.folder.exists()
 
 
 def test_a_killed_training_goes_on_from_its_checkpoint(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

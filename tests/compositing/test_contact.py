@@ -1,10 +1,10 @@
 """Contact: a thick floor does not cover the foot of an object on it, and everything else keeps every bit."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import pytest
 import torch
-from shapes import UP, surfels
+from shapes import UP, same_bits, surfels
 
 from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.compositing.contact import flatten_contact_layers
@@ -51,10 +51,6 @@ def wall() -> Gaussians:
     """Return a wall of the same kind in the plane x = -0.4, 0.1 away from the ball."""
     turn = rotation_about(torch.tensor([0.0, 1.0, 0.0]), torch.pi / 2)
     return Similarity(1.0, turn, torch.tensor([-0.4, 0.0, 0.0])).gaussians(floor())
-
-
-def same_bits(one, other):
-    return all(torch.equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(Gaussians))
 
 
 def shown(thing, target) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,20 +1,13 @@
 """Composite: objects are transformed, Gaussians erased and joined; identities hold exactly."""
 
-from dataclasses import fields
-
 import pytest
 import torch
-from shapes import random_scene
+from shapes import random_scene, same_bits
 
 from splatgraft.composition import compose
-from splatgraft.core.gaussians import Gaussians, empty
+from splatgraft.core.gaussians import empty
 from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
-
-
-def same_bits(a, b):
-    return all(torch.equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(Gaussians))
-
 
 MOVE = Similarity(
     scale=1.7,

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from shapes import UP
+from shapes import UP, blobs, ring
 
 from splatgraft.cli import main
 from splatgraft.composition import (
@@ -80,16 +80,8 @@ def room(ceiling=True, floaters=40):
     if ceiling:
         parts.append(sheet((0, 0, 2.4), (2, 0, 0), (0, 2, 0)))
     n = floaters
-    parts.append(
-        Gaussians(
-            means=(torch.rand(n, 3, generator=g) - 0.5) * torch.tensor([2.0, 2, 0.8]) + torch.tensor([0, 0, 1.2]),
-            log_scales=torch.full((n, 3), math.log(0.03)),
-            quaternions=torch.randn(n, 4, generator=g),
-            opacity_logits=torch.full((n,), -1.5),
-            sh=torch.zeros(n, 1, 3),
-        )
-    )
-    return concatenate(parts)
+    points = (torch.rand(n, 3, generator=g) - 0.5) * torch.tensor([2.0, 2, 0.8]) + torch.tensor([0, 0, 1.2])
+    return concatenate([*parts, blobs(points, 0.03, opacity_logit=-1.5)])
 
 
 def ring_of_cameras(center=(0.0, 0, TABLE), count=16, height=0.7, distance=1.6):
@@ -350,8 +342,8 @@ def test_the_photographed_side_is_turned_to_the_cameras():
     assert facing_yaw_deg(arc, other, up=UP) == pytest.approx(100, abs=10)  # flat optimum, 5 degree steps
     assert facing_yaw_deg(arc, other, up=-UP) == pytest.approx(-100, abs=10)
     assert facing_yaw_deg(arc, arc, up=UP) == 0
-    ring = directions(*[15.0 * i for i in range(24)])
-    assert facing_yaw_deg(ring, other, up=UP) == 0
+    around = directions(*[15.0 * i for i in range(24)])
+    assert facing_yaw_deg(around, other, up=UP) == 0
 
 
 def test_sides_that_no_photo_shows_are_measured_and_said():
@@ -381,9 +373,7 @@ def orbit(first, last, *, count):
 
 
 def cameras_that_look_at_the_edge():
-    angle = torch.arange(12) / 12 * 2 * math.pi
-    eyes = torch.stack([0.55 + 1.6 * angle.cos(), 1.6 * angle.sin(), torch.full_like(angle, TABLE + 0.8)], 1)
-    return pinhole(look_at(eyes, torch.tensor([0.55, 0.0, TABLE]), UP), 200.0, width=240, height=180)
+    return ring(12, height=0.8, radius=1.6, center=(0.55, 0.0, TABLE), focal=200.0, size=(240, 180))
 
 
 def test_a_place_is_away_from_the_table_s_edge_and_a_warning_says_where_none_is():
@@ -427,13 +417,8 @@ def heap(radius, low, high, *, at=(0.0, 0.0), seed=0):
     is_top = torch.arange(n) < n // 2
     across = radius * torch.where(is_top, share.sqrt(), 1.0)
     height = torch.where(is_top, high, low + share * (high - low))
-    return Gaussians(
-        means=torch.stack([at[0] + across * angle.cos(), at[1] + across * angle.sin(), height], 1),
-        log_scales=torch.full((n, 3), math.log(0.012)),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        opacity_logits=torch.full((n,), 4.0),
-        sh=torch.zeros(n, 1, 3),
-    )
+    points = torch.stack([at[0] + across * angle.cos(), at[1] + across * angle.sin(), height], 1)
+    return blobs(points, 0.012, opacity_logit=4.0)
 
 
 SHOULDER = TABLE + 0.6

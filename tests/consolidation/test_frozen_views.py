@@ -1,4 +1,4 @@
-"""Frozen views: equal to the renderer, cropped cameras, transposes, the cache, restriction to changed pixels."""
+"""Frozen views: equal to the renderer, cropped cameras, transposes, and the budget of the cache."""
 
 from dataclasses import replace
 
@@ -8,8 +8,6 @@ from ball_scenes import ball, basis_towards, ring, views_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatgraft.consolidation.color_fit import drop_higher_bands, restrict_to_changes
-from splatgraft.core.gaussians import concatenate
 from splatgraft.fitting import adam
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.lazy_sequence import LazySequence
@@ -66,15 +64,6 @@ def test_the_budget_bounds_what_is_kept():
     assert views_of(scene, cameras, BLACK, cache_bytes=0)[0] is not None
 
 
-def test_what_is_cached_stays_cached_where_a_view_is_not_cropped():
-    scene, cameras = ball(300, degree=2, seed=4), ring(3, 40)
-    views = views_of(scene, cameras, BLACK)
-    operators = [views[index].operator for index in range(3)]
-    part = views.restricted(torch.arange(300) > 9, [(0, 0, 40, 40), None, (0, 0, 39, 40)])
-    assert part[0].operator is operators[0]
-    assert part[1].operator is not operators[2]
-
-
 def test_a_fused_step_of_descent_is_adam_on_the_transpose():
     scene, cameras = ball(150, degree=2, seed=9), ring(2, 40)
     views, generator = views_of(scene, cameras, BLACK), torch.Generator().manual_seed(10)
@@ -113,41 +102,3 @@ def test_an_expansion_and_its_transposes_are_products_with_the_basis(degree):
     squares = torch.zeros(150, basis.shape[1], basis.shape[1])
     view.expansion.add_squares(weights, squares)
     assert torch.allclose(squares, (weights * basis)[:, :, None] * basis[:, None, :], atol=1e-5)
-
-
-def scene_with_a_satellite():
-    far = ball(20, degree=1, seed=8)
-    far = replace(far, means=far.means * 0.2 + torch.tensor([0.0, 1.6, 0.0]))
-    return concatenate([ball(150, degree=1, seed=7), far])
-
-
-def test_nothing_moves_where_nothing_changed():
-    scene, cameras = scene_with_a_satellite(), ring(4)
-    views = restrict_to_changes(views_of(scene, cameras, list(render(scene, cameras).color)), 2 / 255)
-    assert len(views) == 0
-
-
-def test_only_what_changed_pixels_see_moves():
-    scene, cameras = scene_with_a_satellite(), ring(4)
-    darker = replace(scene, sh=torch.cat([scene.sh[:150], scene.sh[150:] - 1.0]))
-    views = restrict_to_changes(views_of(scene, cameras, list(render(darker, cameras).color)), 2 / 255)
-    assert views.active is not None
-    active = torch.zeros(170, dtype=torch.bool)
-    active[views.active] = True
-    visible = render(scene, cameras).visible.any(0)
-    assert bool(active[150:][visible[150:]].float().mean() > 0.9)
-    assert float(active[:150].float().mean()) < 0.5
-    # windows hold the satellite, not the whole picture
-    assert bool((views.cameras.sizes.prod(1) < 48 * 48).all())
-
-
-def test_zero_switches_it_off():
-    scene, cameras = scene_with_a_satellite(), ring(2)
-    views = views_of(scene, cameras, list(render(scene, cameras).color))
-    assert restrict_to_changes(views, 0.0) is views
-
-
-def test_reset_keeps_band_zero_alone():
-    sh = ball(5, degree=3, seed=0).sh
-    assert torch.equal(drop_higher_bands(sh)[:, :1], sh[:, :1])
-    assert not drop_higher_bands(sh)[:, 1:].any()

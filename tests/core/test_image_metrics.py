@@ -1,4 +1,4 @@
-"""PSNR and SSIM against scikit-image, inside regions, and their gradients."""
+"""PSNR and SSIM against scikit-image, whole and inside regions."""
 
 import math
 
@@ -40,12 +40,6 @@ def test_ssim_agrees_with_scikit_image():
     assert np.abs(ssim_map(image, reference).numpy() - full[5:-5, 5:-5]).max() < 2e-3
 
 
-def test_ssim_of_equal_images_is_one_and_psnr_infinite():
-    image, _ = noisy_pair()
-    assert float(ssim(image, image)) == pytest.approx(1, abs=1e-6)
-    assert math.isinf(float(psnr(image, image)))
-
-
 def test_region_metrics_see_only_the_region():
     image, reference = noisy_pair()
     region = torch.zeros(37, 53, dtype=torch.bool)
@@ -56,13 +50,6 @@ def test_region_metrics_see_only_the_region():
     # row 0 lies outside every window centred in rows 12-19
     assert torch.equal(ssim(image, reference, region), ssim(elsewhere, reference, region))
     assert math.isnan(float(psnr(image, reference, torch.zeros_like(region))))
-
-
-def test_ssim_has_a_gradient_that_points_to_the_reference():
-    image, reference = noisy_pair()
-    image.requires_grad_()
-    ssim(image, reference).backward()
-    assert float((image.grad * (reference - image.detach())).sum()) > 0
 
 
 def test_small_images_are_refused():

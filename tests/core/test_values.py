@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from shapes import random_scene
+from shapes import blobs, random_scene
 
 from splatgraft.core import spherical_harmonics as harmonics
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.directions import even_directions, even_pairs, frames_along, perpendicular, tangents, vogel_offsets
-from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.directions import even_directions, even_pairs, perpendicular, tangents, vogel_offsets
+from splatgraft.core.gaussians import concatenate
 from splatgraft.core.rotations import (
     quaternion_from_rotation,
     rotation_about,
@@ -84,13 +84,6 @@ def test_vogel_offsets_lie_in_the_plane_at_their_radii():
     assert abs(float(first[0] @ first[1]) + 0.73737) < 1e-5
 
 
-def test_frames_look_away_from_the_light():
-    directions = even_directions(50)
-    frames = frames_along(directions)
-    assert torch.equal(frames[:, 2], -directions)
-    assert torch.allclose(frames @ frames.transpose(1, 2), torch.eye(3).expand(50, 3, 3), rtol=0, atol=TOLERANCE)
-
-
 def random_rotations(n, seed=0):
     return rotation_from_quaternion(torch.randn(n, 4, generator=torch.Generator().manual_seed(seed)))
 
@@ -151,13 +144,8 @@ def test_projection_inverts_unprojection_and_follows_the_world_rays():
 
 def shell(center, radius, *, count=1000, scale=0.01, opacity=0.9):
     """Return small opaque Gaussians spread evenly over a sphere."""
-    return Gaussians(
-        means=even_directions(count) * radius + torch.tensor(center),
-        log_scales=torch.full((count, 3), scale).log(),
-        quaternions=torch.tensor([1.0, 0, 0, 0]).expand(count, 4),
-        opacity_logits=torch.logit(torch.full((count,), opacity)),
-        sh=torch.zeros(count, 1, 3),
-    )
+    points = even_directions(count) * radius + torch.tensor(center)
+    return blobs(points, scale, opacity_logit=math.log(opacity / (1 - opacity)))
 
 
 def test_it_holds_the_object_and_its_width():

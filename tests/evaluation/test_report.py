@@ -103,11 +103,6 @@ def test_animation_loops_and_fits(tmp_path, suffix):
         assert picture.info["duration"] == 100
 
 
-def test_animation_of_another_kind_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"expected .gif or .webp"):
-        write_animation(tmp_path / "a.mp4", [torch.rand(4, 4, 3)])
-
-
 def test_side_by_side_keeps_the_pictures():
     left, right = torch.full((120, 100, 3), 0.25), torch.full((120, 80, 3), 0.75)
     joined = side_by_side([left, right], ["Before", "After"])

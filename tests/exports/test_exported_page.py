@@ -28,6 +28,7 @@ from waiting import HANG_LIMIT
 from splatgraft import formats
 from splatgraft.cli import main
 from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.image_metrics import psnr
 from splatgraft.core.splitting import split_along
 from splatgraft.exports.export_source import FirstView, first_view
 from splatgraft.exports.pages import write_viewer_page
@@ -92,10 +93,6 @@ class Page:
 
 def screenshot(page: Any) -> torch.Tensor:
     return torch.from_numpy(np.array(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))).float() / 255
-
-
-def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
-    return float(-10 * torch.log10((a - b).square().mean()))
 
 
 def ours(project: Path, size: tuple[int, int] = SIZE) -> tuple[torch.Tensor, torch.Tensor]:

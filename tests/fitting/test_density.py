@@ -1,10 +1,9 @@
 """Density control: the children of a split Gaussian, and which Gaussian is split."""
 
 import torch
-from shapes import random_scene
+from shapes import blobs, random_scene
 
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.gaussians import Gaussians
 from splatgraft.fitting.adam import no_moments
 from splatgraft.fitting.density import DensityControl, split
 from splatgraft.fitting.gaussian_fit import FitState, Step, ViewColors
@@ -29,13 +28,7 @@ def test_children_lie_on_the_long_axis_and_keep_its_variance():
 def split_parents(error_every: int) -> list[float]:
     """Return x of the unsplit Gaussians: three side by side of equal gradients, but the left one has a
     tenth more; the residual lies under the right one."""
-    gaussians = Gaussians(
-        means=torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]]),
-        log_scales=torch.full((3, 3), -2.0),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(3, 1),
-        opacity_logits=torch.full((3,), 2.0),
-        sh=torch.zeros(3, 1, 3),
-    )
+    gaussians = blobs(torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]]), 0.135, opacity_logit=2.0)
     pose = look_at(torch.tensor([[0.0, -4, 0]]), torch.zeros(3), torch.tensor([0.0, 0, 1]))
     camera = pinhole(pose, 48.0, width=48, height=32)
     residual = torch.zeros(32, 48, 3)

@@ -1,10 +1,10 @@
-"""The loop that fits Gaussians to images: fields, rates, the views' colours, checkpoints."""
+"""The loop that fits Gaussians to images: fields, rates, the views' colours."""
 
 from dataclasses import replace
 
 import pytest
+import shapes
 import torch
-from memory_checkpoint import KilledError, MemoryCheckpoint
 
 from splatgraft.core import cameras as camera_values
 from splatgraft.core.gaussians import Gaussians
@@ -27,11 +27,8 @@ def blobs(n: int, seed: int, degree: int = 1) -> Gaussians:
     )
 
 
-def ring(count: int, size: int = 32) -> camera_values.Cameras:
-    angle = torch.arange(count) * (2 * torch.pi / count)
-    eye = torch.stack([3 * angle.cos(), 3 * angle.sin(), torch.ones(count)], 1)
-    poses = camera_values.look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-    return camera_values.pinhole(poses, 1.2 * size, width=size, height=size)
+def ring(count: int) -> camera_values.Cameras:
+    return shapes.ring(count, height=1.0, radius=3.0, focal=38.4, size=(32, 32))
 
 
 class Photographs(list[View]):
@@ -74,27 +71,6 @@ def test_every_field_that_has_a_rate_moves():
     for name in rates.active():
         assert not torch.equal(getattr(fitted, name), getattr(truth, name)), name
     assert torch.equal(fitted.sh[:, 1:], truth.sh[:, 1:])
-
-
-def test_a_killed_fit_resumes_bit_for_bit(monkeypatch):
-    monkeypatch.setattr("splatgraft.fitting.gaussian_fit._CHECKPOINT_SECONDS", -1.0)
-    views, start = views_of(blobs(60, 7)), blobs(60, 8)
-    rates = LearningRates(means=1e-2, means_final=1e-4, log_scales=1e-2, quaternions=1e-2, opacity_logits=1e-2, sh=1e-2)
-    options = FitOptions(40, rates, seed=3)
-    whole = fit(start, views, options)
-    checkpoint = MemoryCheckpoint()
-
-    def die(done: int, total: int, message: str) -> None:
-        if done == 20:
-            raise KilledError
-
-    with pytest.raises(KilledError):
-        fit(start, views, options, progress=die, checkpoint=checkpoint)
-    assert checkpoint.state is not None
-    assert 0 < checkpoint.state["iteration"] < 40
-    resumed = fit(start, views, options, checkpoint=checkpoint)
-    for name in rates.active():
-        assert torch.equal(getattr(whole, name), getattr(resumed, name)), name
 
 
 def test_colours_that_differ_between_views_do_not_enter_the_scene():

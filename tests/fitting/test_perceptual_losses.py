@@ -111,17 +111,6 @@ def test_lpips_has_the_published_structure(weights):
     assert float(loss(target, target)) == 0
 
 
-def test_lpips_moves_the_image_towards_the_target(weights):
-    target, loss = noise(32, 32, 3, seed=1), lpips_vgg(weights)
-    image = noise(32, 32, 3).requires_grad_()
-    before = loss(image, target)
-    (gradient,) = torch.autograd.grad(before, image)
-    assert bool(torch.isfinite(gradient).all())
-    # a step short against the scale of the gradient goes downhill
-    after = loss((image - 1e-3 * gradient / gradient.abs().max()).detach(), target)
-    assert float(after) < float(before.detach())
-
-
 def test_the_networks_weights_are_copied_once(weights, monkeypatch):
     loss, copied, original = lpips_vgg(weights), [], torch.Tensor.to
 

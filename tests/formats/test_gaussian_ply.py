@@ -160,23 +160,6 @@ def test_other_files(tmp_path):
     refusal(tmp_path / "a.obj")
 
 
-def test_failed_write_keeps_the_earlier_file(tmp_path, monkeypatch):
-    path = tmp_path / "a.ply"
-    formats.write_gaussians(path, format_files.random_gaussians(3, 0, seed=1))
-    before = path.read_bytes()
-
-    def fail(*arguments):
-        raise OSError("disk full")
-
-    monkeypatch.setattr(torch, "cat", fail)
-    with pytest.raises(OSError, match="disk full"):
-        formats.write_gaussians(path, format_files.random_gaussians(3, 0, seed=2))
-    assert path.read_bytes() == before
-    assert [entry.name for entry in tmp_path.iterdir()] == ["a.ply"]
-    with pytest.raises(ValueError, match="expected an existing folder"):
-        formats.write_gaussians(tmp_path / "none" / "a.ply", empty())
-
-
 def test_points_round_trip(tmp_path):
     points, colors = torch.randn(50, 3), torch.randint(0, 256, (50, 3)).float() / 255
     formats.write_points(tmp_path / "a.ply", points, colors)

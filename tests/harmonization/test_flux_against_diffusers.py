@@ -13,7 +13,16 @@ from diffusers import FlowMatchEulerDiscreteScheduler, FluxPipeline
 from peft import LoraConfig
 from peft.utils import get_peft_model_state_dict
 from safetensors.torch import save_file
-from tiny_models import CHANNELS, POOLED, TEXT, flux_folder, tiny_autoencoder, tiny_prompt, tiny_transformer
+from tiny_models import (
+    CHANNELS,
+    POOLED,
+    TEXT,
+    flux_folder,
+    kontext_folder,
+    tiny_autoencoder,
+    tiny_prompt,
+    tiny_transformer,
+)
 
 from splatgraft.cli import main
 from splatgraft.harmonization import FluxOptions, HarmonizerContext, make_harmonizer
@@ -161,32 +170,8 @@ def test_a_file_that_does_not_fit_is_one_line(tmp_path, kind):
     assert "\n" not in str(error.value)
 
 
-@pytest.fixture
-def text_encoders(tmp_path):
-    """Write tiny T5 and CLIP with tokenizers, in the folders of FLUX."""
-    torch.manual_seed(0)
-    clip = transformers.CLIPTextConfig(
-        vocab_size=8, hidden_size=POOLED, intermediate_size=16, num_hidden_layers=1, num_attention_heads=2,
-        eos_token_id=1, bos_token_id=0, pad_token_id=1,
-    )  # fmt: skip
-    transformers.CLIPTextModel(clip).eval().save_pretrained(tmp_path / "text_encoder")
-    vocabulary = {"<|startoftext|>": 0, "<|endoftext|>": 1, "a</w>": 2}
-    (tmp_path / "tokenizer").mkdir()
-    (tmp_path / "tokenizer" / "vocab.json").write_text(json.dumps(vocabulary))
-    (tmp_path / "tokenizer" / "merges.txt").write_text("#version: 0.2\n")
-    (tmp_path / "tokenizer" / "tokenizer_config.json").write_text('{"model_max_length": 77}')
-    t5 = transformers.T5Config(vocab_size=8, d_model=TEXT, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
-    transformers.T5EncoderModel(t5).eval().save_pretrained(tmp_path / "text_encoder_2")
-    from tokenizers import Tokenizer, models
-
-    pieces = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0), ("a", -1.0)]
-    rust = Tokenizer(models.Unigram(pieces, unk_id=2))
-    transformers.T5TokenizerFast(tokenizer_object=rust, extra_ids=0).save_pretrained(tmp_path / "tokenizer_2")
-    return tmp_path
-
-
-def test_the_empty_prompt_is_the_stock_pipeline_s_and_lies_where_harmonize_looks(text_encoders, monkeypatch, capsys):
-    folder, words = text_encoders, ["paper", "train", "embed"]
+def test_the_empty_prompt_is_the_stock_pipeline_s_and_lies_where_harmonize_looks(tmp_path, monkeypatch, capsys):
+    folder, words = kontext_folder(tmp_path), ["paper", "train", "embed"]
     monkeypatch.setattr("pathlib.Path.home", lambda: folder / "home")
     assert main([*words, "--base", str(folder), "--tokens", "6"]) == 0
     path = folder / "empty_prompt.safetensors"

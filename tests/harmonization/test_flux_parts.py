@@ -1,4 +1,4 @@
-"""Packing, padding, sampling, widening, baking, choice of the precision: exact against references, on tiny models."""
+"""Padding, sampling, widening, baking, choice of the precision: exact against references, on tiny models."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from tiny_models import CHANNELS, quiet, tiny_prompt, tiny_transformer
 
 from splatgraft.harmonization.flux.baked_modulation import bake
 from splatgraft.harmonization.flux.loading import choose_precision, working_bytes
-from splatgraft.harmonization.flux.network import pack, pad_by_reflection, positions, unpack, velocity, widen_layer
+from splatgraft.harmonization.flux.network import pad_by_reflection, velocity, widen_layer
 from splatgraft.harmonization.flux.sampling import noisy, sample, schnell_levels
 
 pytestmark = list(quiet)
@@ -17,26 +17,6 @@ pytestmark = list(quiet)
 
 def random(*size, seed=0):
     return torch.randn(size, generator=torch.Generator().manual_seed(seed))
-
-
-def test_unpacking_undoes_packing_and_a_token_is_a_block_of_four():
-    latents = random(2, 3, 6, 8)
-    tokens = pack(latents)
-    assert tokens.shape == (2, 12, 12)
-    assert torch.equal(unpack(tokens, 6, 8), latents)
-    assert torch.equal(tokens[0, 5], latents[0, :, 2:4, 2:4].reshape(-1))  # row 1, column 1
-
-    latents = random(2, 16, 6, 8)
-    # FLUX's order: channel, row, column of the block, which is pixel_unshuffle's
-    assert torch.equal(pack(latents), torch.nn.functional.pixel_unshuffle(latents, 2).flatten(2).mT)
-    assert positions(4, 6, torch.device("cpu")).tolist() == [[0, r, c] for r in range(2) for c in range(3)]
-
-
-def test_joining_then_packing_is_packing_then_joining():
-    parts = [random(1, 16, 4, 6, seed=i) for i in range(3)]
-    joined = pack(torch.cat(parts, 1))
-    assert joined.shape == (1, 6, 192)
-    assert torch.equal(joined, torch.cat([pack(part) for part in parts], 2))
 
 
 @pytest.mark.parametrize(("h", "w"), [(32, 48), (31, 47), (17, 1), (5, 16), (1, 3)])
@@ -51,19 +31,6 @@ def test_padding_reaches_a_multiple_of_16_by_mirroring(h, w):
     if h > 8 and w > 8:
         reference = torch.nn.functional.pad(image, (0, -w % 16, 0, -h % 16), mode="reflect")
         assert torch.equal(padded, reference)
-
-
-def test_sampling_takes_the_steps_of_diffusers_scheduler():
-    from diffusers import FlowMatchEulerDiscreteScheduler
-
-    scheduler = FlowMatchEulerDiscreteScheduler(shift=1.0)
-    scheduler.set_timesteps(sigmas=[1.0, 0.75, 0.5, 0.25])
-    assert schnell_levels() == tuple(scheduler.sigmas.tolist())
-    start = random(2, 4, 4, 4)
-    wanted = start
-    for t in scheduler.timesteps:
-        wanted = scheduler.step(torch.sin(wanted) + t / 1000, t, wanted, return_dict=False)[0]
-    assert torch.equal(sample(lambda z, level: torch.sin(z) + torch.tensor(level), start, schnell_levels()), wanted)
 
 
 def test_the_true_velocity_leads_to_the_clean_latents_in_any_number_of_steps():
@@ -119,18 +86,6 @@ def test_baked_in_bfloat16_and_in_batches_finds_its_rows():
             alone = velocity(stock, latents[i : i + 1], t[i : i + 1], prompt)
             # batches round otherwise: a few steps of bfloat16 (2^-8) at values of about one
             assert torch.allclose(together[i], alone[0], atol=0.03)
-
-
-def test_the_share_that_baking_saves_is_that_of_the_real_model():
-    from diffusers import FluxTransformer2DModel
-
-    with torch.device("meta"):  # shapes only
-        real = FluxTransformer2DModel(in_channels=192, out_channels=64)
-    counts = {name: parameter.numel() for name, parameter in real.named_parameters()}
-    gone = sum(n for name, n in counts.items() if ".linear." in name or "time_text_embed" in name)
-    assert round(sum(counts.values()) / 1e9, 2) == 11.89
-    assert round((sum(counts.values()) - gone) / 1e9, 2) == 8.62
-    assert real.x_embedder.weight.shape == (3072, 192)
 
 
 GB = 10**9

@@ -4,23 +4,17 @@ from dataclasses import replace
 
 import pytest
 import torch
+from shapes import blobs
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.harmonization import harmonize, make_harmonizer, render_views
 from splatgraft.rendering import render
 
 
 def spheres(count: int, seed: int, rgb: tuple[float, float, float]) -> Gaussians:
     means = 0.4 * torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
-    return Gaussians(
-        means=means,
-        log_scales=torch.full((count, 3), -2.5),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        opacity_logits=torch.full((count,), 2.0),
-        sh=dc_from_rgb(torch.tensor(rgb)).repeat(count, 1)[:, None],
-    )
+    return blobs(means, 0.08, srgb=rgb, opacity_logit=2.0)
 
 
 def cameras() -> Cameras:
@@ -65,8 +59,3 @@ def test_without_an_image_model_all_views_keep_the_prior() -> None:
     assert all(torch.equal(image, view.prior) for image, view in zip(found, views, strict=True))
     assert calls == [(1, 3), (2, 3), (3, 3)]
     assert len(harmonize(views, make_harmonizer("none"))) == 3
-
-
-def test_names_that_there_are_not_are_refused_with_those_that_there_are() -> None:
-    with pytest.raises(ValueError, match="expected one of edit, flux, none, found 'magic'"):
-        harmonize([], "magic")

@@ -198,18 +198,6 @@ def test_a_benchmark_scene_is_laid_out_sound_with_its_true_light(tmp_path):
 
 
 @pytest.mark.long
-def test_a_turned_object_stands_as_the_placement_says():
-    which = next(scene for scene in benchmark.ROTATIONS if scene.pose_deg == 120)
-    target, source = benchmark.plan(which, benchmark.BenchmarkSize(TINY, 3))
-    place = target.scene.places[0]
-    angle = np.radians(which.pose_deg)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    for before, after in zip(source.objects["object"], target.objects["object"], strict=True):
-        moved = turn @ (np.array(before.location[:2]) - place.location[:2]) + place.location[:2]
-        assert np.allclose(moved, after.location[:2], atol=1e-9)
-
-
-@pytest.mark.long
 def test_a_sun_behind_a_wall_is_no_light_at_the_place_though_an_object_stands_around_the_probe(tmp_path):
     sun = Lamp("sun", (1.0, 1.0, 1.0), 3.0, direction=(1, 0, -1), size=0.01)
     open_air = floor_scene(lamps=[sun])

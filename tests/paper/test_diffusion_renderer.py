@@ -143,27 +143,28 @@ def test_a_picture_that_the_models_cannot_take_is_padded_and_not_stretched(tmp_p
     renderer.close()
 
 
-def test_a_program_that_fails_is_one_line_and_the_next_picture_is_made(tmp_path, python):
+FAILURES = {
+    "raises": (
+        "raise RuntimeError('CUDA out of memory\\n in a kernel')",
+        r"inference_svd_rgbx.py: expected it to succeed, found RuntimeError: CUDA out of memory in a kernel",
+    ),
+    "dies": (
+        "print('Killed', file=sys.stderr, flush=True); os._exit(9)",
+        r"expected it to succeed, found its process ended \(Killed\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("how", FAILURES)
+def test_a_program_that_fails_is_one_line_and_the_next_picture_is_made(tmp_path, python, how):
+    failure, line = FAILURES[how]
     once = "def main():\n    import os\n    if not os.path.exists('failed'):\n        open('failed', 'w').close()\n"
-    once += "        raise RuntimeError('CUDA out of memory\\n in a kernel')\n"
+    once += f"        {failure}\n"
     folder = installation(tmp_path / "code", lambda text: text.replace("def main():\n", once))
     renderer, lights = DiffusionRenderer(folder, python), maps(tmp_path / "maps", 1)
-    draft = drafts(1)[0]
-    line = r"inference_svd_rgbx.py: expected it to succeed, found RuntimeError: CUDA out of memory in a kernel"
     with pytest.raises(ValueError, match=line) as error:
-        renderer.relight(*draft, lights)
-    assert "\n" not in str(error.value)
-    assert len(renderer.relight(*draft, lights)) == 1
-    renderer.close()
-
-
-def test_a_process_that_dies_is_one_line_and_is_started_again(tmp_path, python):
-    once = "def main():\n    import os\n    if not os.path.exists('failed'):\n        open('failed', 'w').close()\n"
-    once += "        print('Killed', file=sys.stderr, flush=True); os._exit(9)\n"
-    folder = installation(tmp_path / "code", lambda text: text.replace("def main():\n", once))
-    renderer, lights = DiffusionRenderer(folder, python), maps(tmp_path / "maps", 1)
-    with pytest.raises(ValueError, match=r"expected it to succeed, found its process ended \(Killed\)"):
         renderer.relight(*drafts(1)[0], lights)
+    assert "\n" not in str(error.value)
     assert len(renderer.relight(*drafts(1)[0], lights)) == 1
     renderer.close()
 

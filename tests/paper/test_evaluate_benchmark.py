@@ -101,20 +101,6 @@ def test_a_second_run_measures_nothing_again(measured):
     assert {path: path.stat().st_mtime_ns for path in files} == before
 
 
-@pytest.mark.parametrize(
-    ("text", "prior", "harmonizer", "loss", "schedule"),
-    [
-        ("copy-paste", "off", None, "fourier", "once"),
-        ("transfer+reinhard/l1-dssim@linear", "transfer", "reinhard", "l1-dssim", "linear"),
-        ("off+flux@geometric", "off", "flux", "fourier", "geometric"),
-        ("off+flux/paper-l1-dssim", "off", "flux", "paper-l1-dssim", "once"),
-    ],
-)
-def test_a_method_is_named_in_one_word(text, prior, harmonizer, loss, schedule):
-    found = Method.parse(text)
-    assert (found.prior, found.harmonizer, found.loss, found.schedule) == (prior, harmonizer, loss, schedule)
-
-
 @pytest.mark.parametrize("text", ["transfre", "transfer/l1-dssim", "off+reinhard/l2", "lbm=nowhere", "=x"])
 def test_a_method_that_means_nothing_is_refused(text):
     with pytest.raises(ValueError, match="--methods: expected"):

@@ -1,20 +1,18 @@
 """The gain of exposure and white balance: the mean light at a place, its limits, and objects between uniform rooms."""
 
 import math
-from dataclasses import fields
 
 import pytest
 import torch
-from shapes import UP
+from shapes import UP, blobs, ring, same_bits
 
 from splatgraft.composition import compose
-from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.directions import even_directions
-from splatgraft.core.gaussians import Gaussians, empty
+from splatgraft.core.gaussians import empty
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.core.similarity import Similarity
-from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
+from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.relighting import SourceScene
 from splatgraft.relighting.light.panorama import Panorama, cube_directions
 from splatgraft_paper.benchmark.gain import local_gain, mean_light, relight_by_gain
@@ -27,16 +25,6 @@ def panorama(radiance, alpha=None, size=16):
     return Panorama(radiance=radiance, alpha=alpha, directions=directions, solid_angles=area)
 
 
-def test_uniform_light_gives_the_ratio_of_radiances():
-    found = local_gain(
-        panorama([0.4, 0.4, 0.4]), panorama([0.6, 0.4, 0.3]), source_up=UP, target_up=torch.tensor([0.0, 1, 0])
-    )
-    # float32 sums over 1536 pixels
-    assert torch.allclose(found.gain, torch.tensor([1.5, 1.0, 0.75]), atol=1e-4)
-    assert not found.held_back
-    assert found.source_coverage == pytest.approx(1, abs=1e-5)
-
-
 def test_light_from_above_counts_and_from_straight_below_hardly():
     directions, _ = cube_directions(32)
     bright = torch.ones(6, 32, 32, 3)
@@ -45,12 +33,6 @@ def test_light_from_above_counts_and_from_straight_below_hardly():
     up_light, down_light = mean_light(above, UP)[0], mean_light(below, UP)[0]
     # caps of equal size: weights (1 + z)/2 average 0.95 and 0.05
     assert torch.allclose(up_light / down_light, torch.full((3,), 19.0), rtol=0.15)  # the cap's edge in pixels
-
-
-def test_the_same_light_is_a_gain_of_exactly_1():
-    place = panorama([0.3, 0.5, 0.2])
-    found = local_gain(place, place, source_up=UP, target_up=UP)
-    assert torch.equal(found.gain, torch.ones(3))
 
 
 def test_gains_beyond_the_limits_are_held_back_and_reported():
@@ -62,28 +44,12 @@ def test_gains_beyond_the_limits_are_held_back_and_reported():
     assert spread.abs().max() < 2 * math.log(1.6)
 
 
-def test_an_empty_panorama_changes_nothing():
-    nothing = panorama([0.0, 0.0, 0.0], alpha=torch.zeros(6, 16, 16))
-    found = local_gain(nothing, panorama([0.5, 0.5, 0.5]), source_up=UP, target_up=UP)
-    assert torch.equal(found.gain, torch.ones(3))
-    assert found.held_back
-    assert found.source_coverage == 0
-
-
 def room(color, *, n=2500, radius=2.0, spread=0.12):
-    return Gaussians(
-        means=radius * even_directions(n),
-        log_scales=torch.full((n, 3), math.log(spread)),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        opacity_logits=torch.full((n,), 8.0),
-        sh=dc_from_rgb(torch.tensor(color)).repeat(n, 1, 1),
-    )
+    return blobs(radius * even_directions(n), spread, srgb=torch.tensor(color), opacity_logit=8.0)
 
 
 def cameras():
-    eyes = torch.tensor([[1.5, 0.0, 0.5], [0.0, 1.5, 0.5], [-1.5, 0.0, 0.5], [0.0, -1.5, 0.5]])
-    up = torch.tensor([0.0, 0, 1])
-    return pinhole(look_at(eyes, torch.zeros(3), up), 100.0, width=64, height=48)
+    return ring(4, height=0.5, radius=1.5, size=(64, 48))
 
 
 MOVE = Similarity(
@@ -114,14 +80,5 @@ def test_an_unknown_or_empty_source_changes_no_bit(scene):
     composite = compose(room([0.5, 0.5, 0.5]), [thing, empty()], target_from_objects=[MOVE, MOVE])
     source = None if scene is None else SourceScene(scene, cameras())
     relit, report = relight_by_gain(composite, cameras(), sources=[source, None])
-    for field in fields(Gaussians):
-        same = (getattr(c.objects[0].gaussians, field.name) for c in (composite, relit))
-        assert torch.equal(*same)
+    assert same_bits(composite.objects[0].gaussians, relit.objects[0].gaussians)
     assert all("pasted as it is" in note.text and note.in_doubt for note in report)
-
-
-def test_one_source_per_object_is_required():
-    composite = compose(room([0.5, 0.5, 0.5]), [], target_from_objects=[])
-    assert relight_by_gain(composite, cameras(), sources=[])[1] == ()
-    with pytest.raises(ValueError, match="expected 0 source scenes, found 1"):
-        relight_by_gain(composite, cameras(), sources=[None])

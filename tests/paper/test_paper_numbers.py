@@ -1,19 +1,11 @@
-"""Numbers and choices of the paper that no recipe holds: names of methods, threshold, ORIDa's amounts, text tokens."""
-
-from types import SimpleNamespace
+"""Numbers and choices of the paper that no recipe holds: names of methods, threshold, ORIDa's amounts."""
 
 import pytest
-import torch
-from tiny_project import ball, photograph, plane
 
-from splatgraft.cli import main
-from splatgraft.core.gaussians import concatenate
 from splatgraft.fitting import l1_dssim
 from splatgraft.fitting.perceptual_losses import windowed_fourier
-from splatgraft.formats import write_gaussians
-from splatgraft.harmonization.flux.prompt import read_prompt
-from splatgraft.project.step import perform
 from splatgraft.runtime.console import Console
+from splatgraft.segmentation import SelectOptions
 from splatgraft.steps.segment import Segment
 from splatgraft_paper.benchmark import methods
 from splatgraft_paper.benchmark.methods import Method, MethodSettings, run_method
@@ -50,21 +42,9 @@ def test_a_method_s_name_selects_its_consolidation(tmp_path, monkeypatch, name, 
     assert step.iterations == 10_000
 
 
-def test_the_step_selects_gaussians_at_the_paper_s_threshold(tmp_path, monkeypatch):
-    asked = []
-
-    def stop(scene, feature, options):
-        asked.append(options.threshold)
-        raise ValueError("seen")
-
-    monkeypatch.setattr("splatgraft.steps.segment.select_object", stop)
-    photograph(tmp_path / "capture", plane((0.6, 0.6, 0.7)), ball())
-    write_gaussians(tmp_path / "scene.ply", concatenate([plane((0.6, 0.6, 0.7)), ball()]))
-    step = Segment(tmp_path / "scene.ply", tmp_path / "capture", tmp_path / "object", device="cpu")
-    with pytest.raises(ValueError, match="seen"):
-        perform(step, Console())
+def test_the_step_selects_gaussians_at_the_paper_s_threshold(tmp_path):
     # section 4: a similarity threshold of 0.75
-    assert asked == [0.75]
+    assert Segment(tmp_path, tmp_path, tmp_path).threshold == SelectOptions().threshold == 0.75
 
 
 def test_relit_sources_have_the_paper_s_amounts(tmp_path):
@@ -72,15 +52,3 @@ def test_relit_sources_have_the_paper_s_amounts(tmp_path):
     orida, generated = OridaPairs(tmp_path, tmp_path), GeneratedPairs(tmp_path, tmp_path)
     assert (orida.number, orida.number * orida.relighting.each) == (2000, 8000)
     assert (generated.number, generated.number * generated.relighting.each) == (1600, 6400)
-
-
-def test_the_empty_prompt_has_256_tokens(tmp_path, monkeypatch):
-    def embedded(base, text):
-        width = 768 if text.encoder == "CLIPTextModel" else 4096
-        return SimpleNamespace(last_hidden_state=torch.ones(1, text.tokens, width), pooler_output=torch.ones(1, width))
-
-    monkeypatch.setattr("splatgraft.harmonization.flux.prompt.embed_text", embedded)
-    assert main(["paper", "train", "embed", str(tmp_path / "prompt.safetensors")]) == 0
-    # FLUX.1-schnell was distilled at 256; diffusers' default is 512
-    prompt = read_prompt(tmp_path / "prompt.safetensors", tokens_width=4096, pooled_width=768)
-    assert prompt.tokens.shape == (256, 4096)

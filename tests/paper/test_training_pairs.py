@@ -35,7 +35,7 @@ from splatgraft_paper.training.pairs import (
     open_training_data,
     split_mixture,
 )
-from splatgraft_paper.training.prompts import ANGLES, ENVIRONMENTS, LIGHTINGS, OBJECTS, prompt
+from splatgraft_paper.training.prompts import ENVIRONMENTS, LIGHTINGS, OBJECTS, prompt
 from splatgraft_paper.training.recipes import Recipe
 from splatgraft_paper.training.relighters import StandInRelighter
 
@@ -114,9 +114,7 @@ def test_a_fitted_picture_has_its_size_and_its_middle(h, w):
     assert abs(float(made.mean()) - 0.5) < 0.02
 
 
-def test_lists_are_long_enough_and_objects_take_turns():
-    assert [len(set(words)) for words in (OBJECTS, ENVIRONMENTS, LIGHTINGS, ANGLES)] >= [60, 20, 12, 8]
-    assert len(set(OBJECTS)) == len(OBJECTS)
+def test_objects_take_turns_in_every_environment_and_lighting():
     made = [prompt(0, i) for i in range(3 * len(OBJECTS))]
     assert set(Counter(p.object for p in made).values()) == {3}
     assert {p.environment for p in made} == set(ENVIRONMENTS)

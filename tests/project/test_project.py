@@ -2,7 +2,6 @@
 
 import os
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -10,8 +9,9 @@ import torch
 from killing import Killed, killed_at_write
 
 from splatgraft.project.record import Job, read_record, why_stale
-from splatgraft.project.step import FolderCheckpoint, job_of, locked, replacing
+from splatgraft.project.step import FolderCheckpoint, locked, plain_options, replacing
 from splatgraft.runtime.files import atomic_folder
+from splatgraft.segmentation import SolidifyOptions
 
 
 def job(folder: Path, files: tuple[Path, ...] = (), **options: object) -> Job:
@@ -66,52 +66,16 @@ def test_files_of_many_gigabytes_are_compared_by_size_and_time(tmp_path: Path) -
     assert why_stale(job(tmp_path / "scene", (weights,))) == "images: model.safetensors changed"
 
 
-@dataclass(frozen=True)
-class Weights:
-    shadow: float = 1.0
-    sizes: tuple[int, ...] = (1, 2)
-
-
-@dataclass(frozen=True)
-class Tint:
-    scene: Path
-    out: Path = Path("tinted")
-    strength: float = 0.5
-    weights: Weights = field(default_factory=Weights)
-
-    def inputs(self) -> dict[str, tuple[Path, ...]]:
-        return {}
-
-    def write(self, folder: Path, context: object) -> None:
-        (folder / "scene.ply").write_text("result")
-
-
-def test_options_of_nested_settings_make_stale(tmp_path: Path) -> None:
-    done = Tint(tmp_path / "scene.ply", tmp_path / "tinted")
-    finish(job_of(done))
-    assert why_stale(job_of(done)) is None
-    assert why_stale(job_of(replace(done, weights=Weights(shadow=0.3)))) == "shadow is now 0.3, was 1.0"
-    assert why_stale(job_of(replace(done, weights=Weights(sizes=(3,))))) == "sizes is now [3], was [1, 2]"
+def test_options_of_nested_settings_are_keys_beside_the_others_without_paths_and_machine(tmp_path: Path) -> None:
+    nested = SolidifyOptions(iterations=7)
+    found = plain_options({"out": tmp_path, "device": "cuda", "point": (1.0, 2.0), "solidify": nested})
+    assert found == {"point": [1.0, 2.0], **vars(nested)}
 
 
 def test_fingerprint_moves_with_inputs_and_options(tmp_path: Path, image: Path) -> None:
     names = {one.fingerprint for one in (job(tmp_path, (image,)), job(tmp_path, (image,), a=1), job(tmp_path))}
     image.write_text("changed")
     assert len(names | {job(tmp_path, (image,)).fingerprint}) == 4
-
-
-def fail_in_the_middle(wanted: Job) -> None:
-    with replacing(wanted) as folder:
-        (folder / "scene.ply").write_text("half")
-        raise RuntimeError("in the middle")
-
-
-def test_a_failed_run_leaves_the_earlier_result_and_nothing_else(tmp_path: Path) -> None:
-    finish(job(tmp_path / "scene"), "earlier")
-    with pytest.raises(RuntimeError, match="in the middle"):
-        fail_in_the_middle(job(tmp_path / "scene"))
-    assert [p.name for p in tmp_path.iterdir()] == ["scene"]
-    assert (tmp_path / "scene" / "scene.ply").read_text() == "earlier"
 
 
 def test_files_that_no_step_wrote_are_never_replaced(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.reconstruction.image_pyramid import Pyramid, read_pyramid
-from splatgraft.reconstruction.options import SPARSE, Sampling
+from splatgraft.reconstruction.options import Sampling
 from splatgraft.rendering import RenderOptions, render
 from splatgraft.runtime.progress import silent
 
@@ -55,11 +55,3 @@ def test_the_pixels_of_a_stride_are_those_of_the_whole_picture(pyramid):
         assert (part - full[top::2, left::2]).abs().mean() < 1e-4
         seen[top::2, left::2] += 1
     assert (seen == 1).all()
-
-
-def test_small_photographs_are_fitted_whole(tmp_path):
-    write_image(tmp_path / "0.png", torch.rand(40, 48, 3))
-    cameras = camera_values.pinhole(torch.eye(4)[None], 50.0, width=48, height=40)
-    capture = PosedImages((tmp_path / "0.png",), cameras, torch.zeros(0, 3), torch.zeros(0, 3))
-    view = read_pyramid(capture, SPARSE, device="cpu", progress=silent).at(0, visit=0, done=0.9)
-    assert view.image.shape == (40, 48, 3)

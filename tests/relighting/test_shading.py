@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from shapes import UP, ring, surfels
+from shapes import UP, blobs, random_scene, ring, surfels
 
 from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core import spherical_harmonics
@@ -28,18 +28,6 @@ from splatgraft.relighting.shading import apply_gain
 from splatgraft.rendering import render
 
 ORIGIN = BoundingSphere(torch.zeros(3), 0.5)
-
-
-def blobs(points, width) -> Gaussians:
-    """Round Gaussians, whose own shape tells no normal."""
-    n = len(points)
-    return Gaussians(
-        means=points,
-        log_scales=torch.full((n, 3), math.log(width)),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        opacity_logits=torch.full((n,), 3.0),
-        sh=dc_from_rgb(torch.full((n, 1, 3), 0.5)),
-    )
 
 
 def noisy_ball(noise=0.01, count=1500):
@@ -116,7 +104,7 @@ def test_without_views_the_estimate_by_neighbours_stays():
     assert torch.equal(fused.confidence, neighbours.confidence)
 
 
-@pytest.mark.parametrize("n", [1, 9, 700])
+@pytest.mark.parametrize("n", [0, 1, 9, 700])
 def test_neighbours_are_the_nearest(n):
     generator = torch.Generator().manual_seed(n)
     # dense clusters, strays far away and repeated points, as captures have them
@@ -130,10 +118,6 @@ def test_neighbours_are_the_nearest(n):
     # float32: two parts in 1e7 of the coordinates, up to 1e3
     assert torch.allclose(away.gather(1, found.long()).sort(1).values, expected, atol=1e-4)
     assert all(len(set(row)) == len(row) for row in found.tolist())
-
-
-def test_no_points_have_no_neighbours():
-    assert nearest_neighbours(torch.zeros(0, 3), count=16).shape == (0, 0)
 
 
 def test_normals_of_a_ball_point_outwards():
@@ -271,15 +255,9 @@ def test_the_report_names_a_mirror(reflectance):
     assert any("is a mirror, whose reflections are only blurred" in note.text for note in report) == (reflectance > 0)
 
 
-def random_gaussians(n=40, k=16, seed=0):
-    g = torch.Generator().manual_seed(seed)
-    return Gaussians(
-        means=torch.randn(n, 3, generator=g),
-        log_scales=torch.randn(n, 3, generator=g),
-        quaternions=torch.randn(n, 4, generator=g),
-        opacity_logits=torch.randn(n, generator=g),
-        sh=torch.randn(n, k, 3, generator=g) * 0.05,
-    )
+def random_gaussians():
+    scene = random_scene(40, 3, seed=0)
+    return replace(scene, sh=scene.sh / 8)  # deviations of 0.05
 
 
 def test_a_gain_of_1_changes_no_bit():

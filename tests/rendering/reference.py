@@ -19,11 +19,7 @@ def projection(
     gaussians: Gaussians, camera: Cameras, options: RenderOptions
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Return centres in pixels, covariances in pixels^2 after the low-pass, opacities, depths."""
-    pose, k = camera.camera_from_world[0].to(gaussians.means), camera.intrinsics[0].to(gaussians.means)
-    x_in_camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
-    depth = x_in_camera[:, 2]
-    slope = x_in_camera[:, :2] / depth[:, None]
-    focal, principal = torch.stack([k[0, 0], k[1, 1]]), k[:2, 2]
+    slope, depth, focal, principal = seen_centers(gaussians, camera)
     sharp = covariance_on_screen(gaussians, camera)[:, :2, :2]
     blurred = sharp + 0.3 * torch.eye(2).to(sharp)
     opacity = gaussians.opacities
@@ -32,13 +28,16 @@ def projection(
     return slope * focal + principal, blurred, opacity, depth
 
 
-def covariance_on_screen(gaussians: Gaussians, camera: Cameras) -> Float[Tensor, "n 3 3"]:
-    """Return covariances of pixel x, pixel y and inverse depth, linearised at the centres."""
+def seen_centers(gaussians: Gaussians, camera: Cameras) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return x / z and y / z (n 2) and depths (n) of the centres, focal lengths (2) and principal point (2)."""
     pose, k = camera.camera_from_world[0].to(gaussians.means), camera.intrinsics[0].to(gaussians.means)
     x_in_camera = gaussians.means @ pose[:3, :3].T + pose[:3, 3]
-    depth = x_in_camera[:, 2]
-    slope = x_in_camera[:, :2] / depth[:, None]
-    focal, principal = torch.stack([k[0, 0], k[1, 1]]), k[:2, 2]
+    return x_in_camera[:, :2] / x_in_camera[:, 2:], x_in_camera[:, 2], torch.stack([k[0, 0], k[1, 1]]), k[:2, 2]
+
+
+def covariance_on_screen(gaussians: Gaussians, camera: Cameras) -> Float[Tensor, "n 3 3"]:
+    """Return covariances of pixel x, pixel y and inverse depth, linearised at the centres."""
+    slope, depth, focal, principal = seen_centers(gaussians, camera)
     size = camera.sizes[0].to(slope)
     margin = 0.15 * size / focal
     held = torch.maximum(torch.minimum(slope, (size - principal) / focal + margin), -principal / focal - margin)
@@ -51,8 +50,14 @@ def covariance_on_screen(gaussians: Gaussians, camera: Cameras) -> Float[Tensor,
         ],
         1,
     )
-    to_screen = jacobian @ pose[:3, :3]
+    to_screen = jacobian @ camera.camera_from_world[0, :3, :3].to(jacobian)
     return to_screen @ gaussians.covariances @ to_screen.transpose(1, 2)
+
+
+def pixels_from(centers: Float[Tensor, "n 2"], camera: Cameras) -> Float[Tensor, "h w n 2"]:
+    """Return the offset of every pixel's middle from every centre, pixels."""
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    return torch.stack([x, y], -1)[:, :, None].to(centers) - centers
 
 
 def inverse_depths(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> Float[Tensor, "h w n"]:
@@ -60,8 +65,7 @@ def inverse_depths(gaussians: Gaussians, camera: Cameras, options: RenderOptions
     center, blurred, _, depth = projection(gaussians, camera, options)
     covariance = covariance_on_screen(gaussians, camera)
     slope = torch.einsum("nij,nj->ni", torch.linalg.inv(blurred), covariance[:, :2, 2])
-    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    away = torch.stack([x, y], -1)[:, :, None].to(center) - center
+    away = pixels_from(center, camera)
     mean = 1 / depth + (away * slope).sum(-1)
     # no gradient if the centre is out of view, because the plane is extrapolated there
     size = camera.sizes[0].to(center)
@@ -77,8 +81,7 @@ def weights(
     order = torch.argsort(depth.detach(), stable=True)
     order = order[(depth >= options.near)[order]]
     center, covariance, opacity = center[order], covariance[order], opacity[order]
-    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    away = torch.stack([x, y], -1)[:, :, None].to(center) - center
+    away = pixels_from(center, camera)
     distance = torch.einsum("hwmi,mij,hwmj->hwm", away, torch.linalg.inv(covariance), away)
     alpha = opacity * torch.exp(-0.5 * distance)
     alpha = torch.where(alpha >= MIN_ALPHA, alpha.clamp_max(MAX_ALPHA), 0)
@@ -127,7 +130,6 @@ def render(
 def undecided(gaussians: Gaussians, camera: Cameras, options: RenderOptions) -> Bool[Tensor, "h w"]:
     """Return pixels that rounding to float32 may decide otherwise: an alpha within 1e-4 of either of its bounds."""
     center, covariance, opacity, _ = projection(gaussians, camera, options)
-    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    away = torch.stack([x, y], -1)[:, :, None].to(center) - center
+    away = pixels_from(center, camera)
     alpha = opacity * torch.exp(-0.5 * torch.einsum("hwmi,mij,hwmj->hwm", away, torch.linalg.inv(covariance), away))
     return ((alpha / MIN_ALPHA - 1).abs() < 1e-4).any(-1) | ((alpha / MAX_ALPHA - 1).abs() < 1e-4).any(-1)

@@ -72,29 +72,14 @@ print(threading_layer())
 """
 
 
-@pytest.mark.parametrize(("absent", "layer"), [((), "omp"), (("omppool",), "workqueue")])
-def test_tbb_is_not_used_where_it_is_installed(absent, layer):
+@pytest.mark.parametrize(
+    ("absent", "named", "layer"),
+    [((), None, "omp"), (("omppool",), None, "workqueue"), ((), "workqueue", "workqueue")],
+)
+def test_tbb_is_not_used_where_it_is_installed_and_the_layer_that_the_user_names_is(absent, named, layer):
     """An installed TBB is simulated: numba would take it first."""
     pytest.importorskip("numba.np.ufunc.omppool")
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_THREADING_LAYER"}
+    environment |= {"NUMBA_THREADING_LAYER": named} if named else {}
     program = [sys.executable, "-c", LAYERS, *absent]
     assert subprocess.check_output(program, env=environment, text=True).split() == [layer]
-
-
-@pytest.mark.parametrize("layer", ["omp", "workqueue"])
-def test_kernels_run_on_the_layer_that_the_user_names(layer):
-    program = (
-        "import numpy as np, numba\n"
-        "from splatgraft.runtime.kernels import threading_layer\n"
-        "@numba.njit(parallel=True)\n"
-        "def double(x):\n"
-        "    for i in numba.prange(len(x)):\n"
-        "        x[i] *= 2\n"
-        "    return x\n"
-        "print(int(double(np.ones(100)).sum()), threading_layer())"
-    )
-    environment = {**os.environ, "NUMBA_THREADING_LAYER": layer}
-    assert subprocess.check_output([sys.executable, "-c", program], env=environment, text=True).split() == [
-        "200",
-        layer,
-    ]

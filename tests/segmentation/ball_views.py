@@ -4,24 +4,17 @@ import math
 
 import pytest
 import torch
+from shapes import blobs
 
 from splatgraft.core.cameras import look_at, pinhole
-from splatgraft.core.gaussians import Gaussians, concatenate
-from splatgraft.core.spherical_harmonics import dc_from_rgb
+from splatgraft.core.gaussians import concatenate
 from splatgraft.rendering import render
 
 BALL = 300
 
 
 def splats(means, scale, opacity, rgb):
-    n = len(means)
-    return Gaussians(
-        means=means,
-        log_scales=torch.full((n, 3), math.log(scale)),
-        quaternions=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
-        opacity_logits=torch.logit(torch.full((n,), opacity)),
-        sh=dc_from_rgb(rgb)[:, None],
-    )
+    return blobs(means, scale, srgb=rgb, opacity_logit=math.log(opacity / (1 - opacity)))
 
 
 @pytest.fixture(scope="session")
