@@ -128,16 +128,24 @@ def past_no_scene(maps: SceneShadowMaps, points: Tensor, normals: Tensor) -> Ten
     return torch.ones(len(points), sources + len(maps.ambient_maps.first))
 
 
-def past_no_object(gaussians: Gaussians, sphere: object, normals: Tensor, samples: LightSamples) -> Tensor:
-    return torch.ones(gaussians.count, len(samples))
+def past_no_object(
+    gaussians: Gaussians, sphere: object, normals: Tensor, lights: Sequence[LightSamples]
+) -> tuple[Tensor, ...]:
+    return tuple(torch.ones(gaussians.count, len(samples)) for samples in lights)
 
 
 def past_object(
-    gaussians: Gaussians, sphere: BoundingSphere, normals: Tensor, samples: LightSamples, *, sources_pass: bool
-) -> Tensor:
+    gaussians: Gaussians,
+    sphere: BoundingSphere,
+    normals: Tensor,
+    lights: Sequence[LightSamples],
+    *,
+    sources_pass: bool,
+) -> tuple[Tensor, ...]:
     """Return the visibility past the object, but 1 for the sources' samples, or for those of the ambient light."""
-    passes = torch.tensor(samples.is_source) == sources_pass
-    return torch.where(passes, 1, self_visibility(gaussians, sphere, normals, samples))
+    passes = [torch.tensor(samples.is_source) == sources_pass for samples in lights]
+    shares = self_visibility(gaussians, sphere, normals, lights)
+    return tuple(torch.where(passing, 1, share) for passing, share in zip(passes, shares, strict=True))
 
 
 def with_samples(function: Callable[..., Any], at: int, **values: float) -> Callable[..., Any]:
@@ -309,6 +317,7 @@ ROWS: Mapping[str, Row] = {
         "bounce in the colour of the unlit side; the mean colour",
         {"relighting.shadows.scene_ratio.occlusion_from_maps": evenly_colored},
     ),
+    "bounce-limit": Row("object", "limit of the albedo", {"relighting.prepared_object._MAX_ALBEDO": _MANY}),
     "darkest": Row(
         "shadows",
         "lower limit of shadows",

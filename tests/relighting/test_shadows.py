@@ -464,7 +464,7 @@ cameras = pinhole(look_at(eyes, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])), 
 window = Window(torch.zeros(3), 1.5, frames_along(even_directions(8)))
 
 def maps():
-    found = splat_depth_maps(occluders_of(ball), window, size=64, with_color=False)
+    found = splat_depth_maps(occluders_of(ball), window, size=64)
     visibility(found, points, points, bias=0.1)
 
 def again(work):

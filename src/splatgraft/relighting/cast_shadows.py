@@ -95,11 +95,7 @@ def _on_scene(
         if total is None:
             total = ratio
             continue
-        total = SceneRatio(
-            shadow=total.shadow[parents] * ratio.shadow,
-            bounce=total.bounce[parents] + ratio.bounce,
-            slope=total.slope[parents],
-        )
+        total = replace(ratio, shadow=total.shadow[parents] * ratio.shadow, bounce=total.bounce[parents] + ratio.bounce)
     assert total is not None
 
     def ratio_at(points: Tensor, normals: Tensor, receiver: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numba import prange
 from torch import Tensor
 
@@ -40,10 +40,6 @@ class Normals:
     """Confidence in [0, 1]: 0 for neighbours that form a round cloud or disagree, 1 on a plane."""
     seen: Bool[Tensor, "n"]
     """Whether some camera sees the Gaussian unoccluded; the colours of all others were never observed."""
-
-    def select(self, rows: Int[Tensor, "m"]) -> "Normals":
-        """Select the normals of m Gaussians."""
-        return Normals(self.vectors[rows], self.confidence[rows], self.seen[rows])
 
 
 def estimate_normals(

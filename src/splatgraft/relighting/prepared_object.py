@@ -163,25 +163,24 @@ def prepare_object(
     seen_from = cameras if source is None else placed.target_from_object.cameras(source.cameras)
     views = object_views(gaussians, sphere, seen_from)
     normals = _normals(placed, source, gaussians, seen_from, views)
-    lighting, notes = None, []
-    if isinstance(source_light, NoLight):
-        notes.append(Note(f"At the old place of object {number}: {source_light.reason}"))
-    elif source is not None and source_light is not None:
-        estimate = source_light if isinstance(source_light, EstimatedLight) else None
-        old = source_light.light if isinstance(source_light, EstimatedLight) else source_light
-        described = describe_light(old, estimate_up(source.cameras)) + ("." if estimate is not None else ", as given.")
-        old = old.rotated(placed.target_from_object.rotation)
-        old_samples = sample_light(old)
-        shares = self_visibility(gaussians, sphere, normals.vectors, old_samples)
+    samples, lighting, notes = sample_light(light), None, []
+    estimate = source_light if isinstance(source_light, EstimatedLight) else None
+    old = source_light.light if isinstance(source_light, EstimatedLight) else source_light
+    if isinstance(old, Light) and source is not None:
+        turned = old.rotated(placed.target_from_object.rotation)
+        old_samples = sample_light(turned)
+        visible, shares = self_visibility(gaussians, sphere, normals.vectors, (samples, old_samples))
         received = irradiance(old_samples, normals.vectors, sample_visibility=shares)
-        materials = estimate_materials(gaussians, normals.vectors, views, reflected_light(old, old_samples, shares))
-        lighting = SourceLighting(old, received, materials, estimate)
+        materials = estimate_materials(gaussians, normals.vectors, views, reflected_light(turned, old_samples, shares))
+        lighting = SourceLighting(turned, received, materials, estimate)
+        described = describe_light(old, estimate_up(source.cameras)) + ("." if estimate is not None else ", as given.")
         notes.append(Note(f"At the old place of object {number}: {described}{_gloss_note(materials, gaussians)}"))
-    if lighting is None:
+    else:
+        (visible,) = self_visibility(gaussians, sphere, normals.vectors, (samples,))
+        if isinstance(old, NoLight):
+            notes.append(Note(f"At the old place of object {number}: {old.reason}"))
         unknown = f"The old light of object {number} is unknown: the object keeps its mean brightness."
         notes.append(Note(unknown, "warning"))
-    samples = sample_light(light)
-    visible = self_visibility(gaussians, sphere, normals.vectors, samples)
     received = irradiance(samples, normals.vectors, sample_visibility=visible)
     radiance = _albedo(gaussians, lighting) * received / math.pi
     return PreparedObject(

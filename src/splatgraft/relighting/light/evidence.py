@@ -166,7 +166,7 @@ def find_shading_evidence(captured: CapturedScene, *, region: BoundingSphere) ->
     window = Window(center=region.center, radius=region.radius, frames=frames_along(DIRECTIONS))
     nearest = torch.full((len(DIRECTIONS),), -region.radius)
     occluders = _occluders(scene, region)
-    maps = splat_depth_maps(occluders, window, size=_MAP_SIZE, with_color=False, nearest=nearest)
+    maps = splat_depth_maps(occluders, window, size=_MAP_SIZE, nearest=nearest)
     visible = visibility(maps, points, facing, bias=_BIAS * maps.texel)
     area = scene.scales[chosen].sort(1).values[:, 1:].prod(1)
     certain = scene.opacities[chosen] * normals.confidence[chosen].clamp_min(0.05)

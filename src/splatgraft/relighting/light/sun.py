@@ -134,7 +134,7 @@ class Surface:
         """
         radius = 1.05 * self.half
         window = Window(center=self.center, radius=radius, frames=frames_along(directions))
-        alpha = splat_depth_maps(occluders, window, size=_SIZE, with_color=False).alpha
+        alpha = splat_depth_maps(occluders, window, size=_SIZE).alpha
         at = torch.einsum("kij,stj->ksti", window.frames[:, :2], self.texels(every) - self.center) / radius
         return 1 - F.grid_sample(alpha[:, None], at, align_corners=False)[:, 0]
 

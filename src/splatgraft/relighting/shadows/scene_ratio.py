@@ -8,7 +8,8 @@ Differential rendering (Debevec 1998): the ratio of irradiance with the object t
 """
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -31,8 +32,7 @@ from splatgraft.relighting.shadows.shadow_maps import (
 
 # shadow maps of objects and scenes; set by hand
 _SOURCE_SIZE = 512  # pixels, a multiple of 16; width of a source sample's map
-AMBIENT_SIZE = 256
-"""Width of an ambient sample's map, pixels, a multiple of 16."""
+_AMBIENT_SIZE = 256  # the same for an ambient sample
 _OBJECT_BIAS = (2.0, 1.0)  # pixels, for sources and ambient light; nearer occluders are the receiver's own surface
 _SELF_BIAS = 2.5  # pixels, for an object's shadow on itself
 _SCENE_BIAS = (2.5, 1.5)  # pixels, for the scene's shadow on itself and on objects
@@ -65,7 +65,7 @@ def object_shadow_maps(
         samples: Samples of the light at the object's place.
         radiance: Linear rgb that the Gaussians reflect in that light.
     """
-    occluders = replace(occluders_of(gaussians), linear_rgb=radiance)
+    occluders = occluders_of(gaussians)
     sources, ambient = samples.of_sources, samples.of_ambient
     source_bias, ambient_bias = _OBJECT_BIAS
     occlusions = []
@@ -75,12 +75,12 @@ def object_shadow_maps(
         # seen from a near light, the sphere's rim lies farther out than its radius
         rim = sphere.radius / math.sqrt(1 - (float(nearness.max()) * sphere.radius) ** 2)
         window = Window(sphere.center, rim, frames_along(both), torch.cat([nearness, -nearness]))
-        maps = splat_depth_maps(occluders, window, size=_SOURCE_SIZE, with_color=True)
+        maps = splat_depth_maps(occluders, window, size=_SOURCE_SIZE, color=radiance)
         front = torch.arange(len(sources))
         occlusion = occlusion_from_maps(maps, front, front + len(front))
         occlusions.append((sources, occlusion, source_bias * maps.texel))
     window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(ambient.directions))
-    maps = splat_depth_maps(occluders, window, size=AMBIENT_SIZE, with_color=True)
+    maps = splat_depth_maps(occluders, window, size=_AMBIENT_SIZE, color=radiance)
     front = torch.arange(len(ambient))
     back = (front + len(front) // 2) % len(front)
     occlusions.append((ambient, occlusion_from_maps(maps, front, back), ambient_bias * maps.texel))
@@ -88,24 +88,27 @@ def object_shadow_maps(
 
 
 def self_visibility(
-    gaussians: Gaussians, sphere: BoundingSphere, normals: Float[Tensor, "m 3"], samples: LightSamples
-) -> Float[Tensor, "m k"]:
-    """Compute the visibility of every light sample from an object's own Gaussians, past the object itself.
+    gaussians: Gaussians, sphere: BoundingSphere, normals: Float[Tensor, "m 3"], lights: Sequence[LightSamples]
+) -> tuple[Float[Tensor, "m _"], ...]:
+    """Compute the visibility of every sample of some lights from an object's own Gaussians, past the object itself.
 
     Args:
         gaussians: The m Gaussians of the object.
         sphere: The object's bounding sphere.
         normals: Unit normals of their surfaces.
-        samples: k samples of a light.
+        lights: Samples of each light; the directions of ambient samples are the same for all.
 
     Returns:
-        Share of each sample that arrives, in [0, 1].
+        For each light, the share of its k samples that arrives, (m, k) in [0, 1].
     """
-    window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(samples.directions))
-    maps = splat_depth_maps(occluders_of(gaussians), window, size=AMBIENT_SIZE, with_color=False)
+    sources = [samples.of_sources.directions for samples in lights]
+    directions = torch.cat([*sources, lights[0].of_ambient.directions])
+    window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(directions))
+    maps = splat_depth_maps(occluders_of(gaussians), window, size=_AMBIENT_SIZE)
     visible = visibility(maps, raised(gaussians, normals), normals, bias=_SELF_BIAS * maps.texel)
-    passing = torch.where(torch.tensor(samples.is_source), 0.0, _SELF_AMBIENT)
-    return passing + (1 - passing) * visible
+    *by_sources, ambient = visible.split([*map(len, sources), len(lights[0].of_ambient)], dim=1)
+    ambient = _SELF_AMBIENT + (1 - _SELF_AMBIENT) * ambient
+    return tuple(torch.cat([one, ambient], 1) for one in by_sources)
 
 
 @dataclass(frozen=True)
@@ -125,13 +128,13 @@ def scene_shadow_maps(scene: Gaussians, region: BoundingSphere, samples: LightSa
     maps: list[DepthMaps | None] = []
     reach = 1.5 * region.radius + 3 * scene.scales.max(1).values
     blockers = scene.select((scene.means - region.center).norm(dim=1) < reach)
-    sizes = (_SOURCE_SIZE, AMBIENT_SIZE)
+    sizes = (_SOURCE_SIZE, _AMBIENT_SIZE)
     for part, size in zip((samples.of_sources, samples.of_ambient), sizes, strict=True):
         window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
         nearest = -torch.tensor(part.blockers_within).clamp_max(region.radius)
         # Gaussians finer than a pixel of the map add no detail, so a random part of them is enough
         occluders = occluders_of(thinned(blockers, width=2 * region.radius / size))
-        splatted = splat_depth_maps(occluders, window, size=size, with_color=False, nearest=nearest)
+        splatted = splat_depth_maps(occluders, window, size=size, nearest=nearest)
         maps.append(splatted if len(part) else None)
     of_sources, of_ambient = maps
     assert of_ambient is not None

@@ -15,8 +15,6 @@ from numba import get_num_threads, prange
 from torch import Tensor
 
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import linear_from_srgb
-from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.rendering.cpu_simd import LANES, lanes, largest, load, smaller, store, where_at_least, where_below
 from splatgraft.runtime.kernels import kernel, serialized
 
@@ -66,8 +64,6 @@ class Occluders:
     """Covariances, world units squared."""
     opacities: Float[Tensor, "n"]
     """Opacities in [0, 1]."""
-    linear_rgb: Float[Tensor, "n 3"]
-    """Colour from the zeroth band, linear, in [0, 1]."""
 
 
 def occluders_of(gaussians: Gaussians) -> Occluders:
@@ -76,7 +72,6 @@ def occluders_of(gaussians: Gaussians) -> Occluders:
         means=gaussians.means,
         covariances=gaussians.covariances,
         opacities=gaussians.opacities,
-        linear_rgb=linear_from_srgb(rgb_from_dc(gaussians.sh[:, 0]).clamp(0, 1)),
     )
 
 
@@ -115,7 +110,12 @@ class DepthMaps:
 
 
 def splat_depth_maps(
-    occluders: Occluders, window: Window, *, size: int, with_color: bool, nearest: Float[Tensor, "k"] | None = None
+    occluders: Occluders,
+    window: Window,
+    *,
+    size: int,
+    color: Float[Tensor, "n 3"] | None = None,
+    nearest: Float[Tensor, "k"] | None = None,
 ) -> DepthMaps:
     """Splat depth maps of `occluders`, blended front to back as the renderer does.
 
@@ -123,20 +123,21 @@ def splat_depth_maps(
         occluders: All Gaussians that may block light.
         window: Sphere that the maps cover, and their frames.
         size: Width of a map, pixels, a multiple of 16.
-        with_color: Whether to keep colour and mean depth too.
+        color: Linear rgb of the occluders, to keep it and the mean depth, too.
         nearest: Smallest depth per map, world units; occluders nearer to the light are left out.
     """
     k = len(window.frames)
-    c = k if with_color else 0
+    c = 0 if color is None else k
     assert size % LANES == 0
     first, transmittance = np.zeros((k, size, size), np.float32), np.ones((k, size, size), np.float32)
-    mean, color = np.zeros((c, size, size), np.float32), np.zeros((c, 3, size, size), np.float32)
+    mean, blended = np.zeros((c, size, size), np.float32), np.zeros((c, 3, size, size), np.float32)
     geometry = (_array(occluders.means), _array(occluders.covariances), _array(occluders.opacities))
     view = (_array(window.frames), _array(window.center), np.float32(window.radius))
     limits = _array(nearest) if nearest is not None else np.full(k, -FAR, np.float32)
     nearness = _array(window.nearness) if window.nearness is not None else np.zeros(k, np.float32)
-    planes = (first, transmittance, mean, color)
-    _splat(geometry, _array(occluders.linear_rgb), view, (limits, nearness), planes, get_num_threads())
+    planes = (first, transmittance, mean, blended)
+    rgb = np.zeros((0, 3), np.float32) if color is None else _array(color)
+    _splat(geometry, rgb, view, (limits, nearness), planes, get_num_threads())
     first[transmittance >= _HALF] = FAR
     alpha = np.subtract(np.float32(1), transmittance, out=transmittance)
     mean /= np.maximum(alpha[:c], np.float32(1e-6))
@@ -145,7 +146,7 @@ def splat_depth_maps(
         first=torch.from_numpy(first),
         alpha=torch.from_numpy(alpha),
         mean=torch.from_numpy(mean),
-        color=torch.from_numpy(color),
+        color=torch.from_numpy(blended),
     )
 
 
