@@ -75,6 +75,7 @@ def cuda_tests(setting: Setting) -> list[Row]:
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     last = done.stdout.strip().splitlines()[-1] if done.stdout.strip() else done.stderr.strip()[-200:]
     if not setting.toy and done.returncode:
+        print(done.stdout)
         raise RuntimeError(last)
     return [{"tests": last}]
 
@@ -241,7 +242,9 @@ def lora_step(setting: Setting) -> list[Row]:
 
     def step() -> None:
         optimizer.zero_grad()
-        found = velocity(network.transformer, latents, level, network.prompt)
+        # as the training does: fp32 weights of the adaptation, arithmetic in bf16
+        with torch.autocast(setting.device.type, torch.bfloat16, enabled=network.dtype == torch.bfloat16):
+            found = velocity(network.transformer, latents, level, network.prompt)
         (found - wanted).float().square().mean().backward()
         optimizer.step()
 

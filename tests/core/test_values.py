@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from shapes import blobs, random_scene
+from shapes import blobs, camera_inside, random_scene
 
 from splatgraft.core import spherical_harmonics as harmonics
 from splatgraft.core.bounds import bounding_sphere
@@ -127,6 +127,15 @@ def test_look_at_stays_on_the_device_of_its_points():
     # torch's device without data stands for a GPU
     poses = look_at(*(torch.zeros(shape, device="meta") for shape in ((2, 3), (3,), (3,))))
     assert (poses.device.type, poses.shape) == ("meta", (2, 4, 4))
+
+
+def test_a_camera_computes_on_its_own_device():
+    # torch's device without data stands for a GPU
+    camera = camera_inside().to("meta")
+    world = camera.unproject(torch.ones(camera.height, camera.width, device="meta"))
+    smaller = camera.cropped([(1, 1, 9, 9)]).resized(0.5).intrinsics
+    for found in (camera.rays(), camera.world_rays(), world, camera.project(world)[0], camera.centers, smaller):
+        assert found.device.type == "meta"
 
 
 def test_projection_inverts_unprojection_and_follows_the_world_rays():

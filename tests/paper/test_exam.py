@@ -35,6 +35,7 @@ def test_a_number_is_an_exam():
     # all kinds, in another order
     assert sorted(scene.kind for scene in first) == sorted(places.KINDS) == sorted(scene.kind for scene in other)
     assert len({scene.name for scene in first}) == 8
+    assert {scene.kind for scene in draw_scenes(7, 4, places.OUTDOORS)} == set(places.OUTDOORS)
 
 
 def test_no_seed_of_an_exam_is_known():

@@ -119,7 +119,8 @@ class Cameras:
 
     def rays(self) -> Float[Tensor, "h w 3"]:
         """Compute directions to the pixel centres of the first camera, in its axes, scaled to depth 1."""
-        v, u = torch.meshgrid(torch.arange(self.height) + 0.5, torch.arange(self.width) + 0.5, indexing="ij")
+        rows, columns = (torch.arange(n, device=self.intrinsics.device) + 0.5 for n in (self.height, self.width))
+        v, u = torch.meshgrid(rows, columns, indexing="ij")
         return torch.stack([u, v, torch.ones_like(u)], -1) @ torch.linalg.inv(self.intrinsics[0]).T
 
     def world_rays(self) -> Float[Tensor, "h w 3"]:

@@ -132,7 +132,8 @@ class Segment:
     def write(self, folder: Path, context: Context) -> None:
         """Write the object and the scene without it."""
         device = choose_device(self.device, context.console)
-        scene = read_gaussians(self.scene).to(device)
+        scene = read_gaussians(self.scene)
+        on_device = scene.to(device)
         box = None if self.box is None else Box(torch.tensor(self.box[:3]), torch.tensor(self.box[3:]))
         capture = read_capture(self.capture)
         masked, feature = None, None
@@ -141,11 +142,12 @@ class Segment:
                 raise ValueError("--mask-source box: expected --box beside it, found none")
             feature = box.contains(scene.means).float()
         else:
-            masked = self._masked_views(capture, scene, folder, box, context)
+            masked = self._masked_views(capture, on_device, folder, box, context)
             cameras = masked.views.cameras.to(device)
-            feature = lift_masks(scene, cameras, masked.masks, self.options, progress=context.progress)
+            feature = lift_masks(on_device, cameras, masked.masks, self.options, progress=context.progress)
             if masked.region is not None:
-                feature = feature * masked.region.allows(scene.means)
+                feature = feature * masked.region.allows(on_device.means)
+            feature = feature.cpu()
         selection = select_object(scene, feature, SelectOptions(threshold=self.threshold, box=box, keep=self.keep))
         if self.corrections is not None:
             selection = apply_corrections(selection, read_corrections(self.corrections))
@@ -157,17 +159,19 @@ class Segment:
             views, photographs = _photographs(masked)
             options = SolidifyOptions(self.solidify, view_gains=read_view_gains(views.image_paths))
             cameras = views.cameras.to(device)
-            chosen = solidify_object(scene, selection, cameras, photographs, options=options, progress=context.progress)
+            chosen = solidify_object(
+                on_device, selection.to(device), cameras, photographs, options=options, progress=context.progress
+            ).to("cpu")
             context.console.say(f"object, made solid: {chosen.count:,} Gaussians")
         is_guessed = torch.zeros(chosen.count, dtype=torch.bool)
         if not self.keep_open and masked is not None:
             chosen, is_guessed = self._closed(chosen, masked, folder, context)
-        write_gaussians(folder / OBJECT_FILE, chosen.to("cpu"))
+        write_gaussians(folder / OBJECT_FILE, chosen)
         write_flags(folder / IS_GUESSED_FILE, is_guessed)
-        write_gaussians(folder / SURROUNDINGS_FILE, scene.select(~selection).to("cpu"))
+        write_gaussians(folder / SURROUNDINGS_FILE, scene.select(~selection))
         write_flags(folder / SELECTION_FILE, selection)
         with atomic_write(folder / "feature.npy") as stream:
-            np.save(stream, feature.cpu().numpy())
+            np.save(stream, feature.numpy())
 
     def _source(self, capture: PosedImages) -> MaskSource:
         """Return the source of masks, with `auto` resolved."""

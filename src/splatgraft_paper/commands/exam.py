@@ -16,13 +16,16 @@ import tyro
 import splatgraft
 import splatgraft_paper.exam
 from splatgraft.reconstruction import ReconstructOptions
+from splatgraft.reconstruction.options import Quality
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.process import source_commit
 from splatgraft_paper.exam.measure import ROWS, SceneResult, evaluate_scene
 from splatgraft_paper.exam.scenes import SIZE, TRAINING_NUMBER, draw_scenes, read_scene, render_scene
 from splatgraft_paper.exam.summary import summarize_light, summarize_row, summary_markdown
-from splatgraft_paper.synthesis.jobs import RenderWorkers
+from splatgraft_paper.synthesis.benchmark import BenchmarkSize
+from splatgraft_paper.synthesis.jobs import RenderWorkers, read_render_size
+from splatgraft_paper.synthesis.places import KINDS
 
 
 @dataclass(frozen=True)
@@ -43,10 +46,18 @@ class Exam:
     build/exam/NUMBER. A picture has columns of held-out views: pasted, transfer, transfer with all truth, truth."""
     work: Path | None = None
     """Folder of the reconstructions, which runs may share; default: OUT/work."""
-    iterations: int = 1000
-    """Steps of each reconstruction."""
-    budget: int = 20_000
-    """Gaussians of each reconstruction."""
+    kinds: tuple[str, ...] = KINDS
+    """Kinds of places that the scenes are drawn from."""
+    views: int = SIZE.views
+    """Views of each capture."""
+    pixels: str = f"{SIZE.render.width}x{SIZE.render.height}"
+    """Pixels of a picture, WIDTHxHEIGHT."""
+    quality: Quality = "draft"
+    """Quality of each reconstruction."""
+    iterations: int | None = None
+    """Steps of each reconstruction; default: 1000 for a draft, else those of the quality."""
+    budget: int | None = None
+    """Gaussians of each reconstruction; default: 20,000 for a draft, else those of the quality."""
     rows: tuple[str, ...] = tuple(row for row in ROWS if row != "3dgs-dr")
     """Rows of the table; 3dgs-dr is not in the default, because it fits two more scenes."""
     workers: RenderWorkers = field(default_factory=RenderWorkers)
@@ -75,7 +86,12 @@ class Exam:
 
     @property
     def _options(self) -> ReconstructOptions:
-        return ReconstructOptions(iterations=self.iterations, budget=self.budget)
+        steps, most = (1000, 20_000) if self.quality == "draft" else (None, None)
+        return ReconstructOptions(quality=self.quality, iterations=self.iterations or steps, budget=self.budget or most)
+
+    @property
+    def _size(self) -> BenchmarkSize:
+        return BenchmarkSize(read_render_size(self.pixels, SIZE.render.samples), self.views)
 
     def _scene_folders(self, out: Path, console: Console) -> Iterator[tuple[str, partial[Path]]]:
         """Yield the name of each scene, and a function that renders what is missing of it and returns its folder."""
@@ -86,8 +102,11 @@ class Exam:
             return
         python = self.workers.python(console)
         assert self.number is not None
-        for which in draw_scenes(self.number, self.scenes or 12):
-            yield which.name, partial(render_scene, which, out, python, jobs=self.workers.processes)
+        if unknown := [kind for kind in self.kinds if kind not in KINDS]:
+            raise ValueError(f"--kinds: expected names among {', '.join(KINDS)}; found {unknown[0]}")
+        jobs, size = self.workers.processes, self._size
+        for which in draw_scenes(self.number, self.scenes or 12, self.kinds, size):
+            yield which.name, partial(render_scene, which, out, python, jobs=jobs, size=size)
 
     def _result(self, folder: Path, out: Path, rows: tuple[str, ...], console: Console) -> SceneResult:
         """Return the result of one rendered scene; measure it again if the code or an option has changed."""
@@ -120,11 +139,11 @@ class Exam:
             "budget": self._options.max_gaussians,
             "failures": failures,
         }
-        size = f"{SIZE.render.width}x{SIZE.render.height}, {SIZE.views} views, {SIZE.render.samples} samples; "
+        size = f"{self.pixels}, {self.views} views, {SIZE.render.samples} samples; "
         conditions = (
             f"`{head['command']}` at commit {head['commit']}. {size if self.scenes_from is None else ''}"
-            f"{head['iterations']} iterations, at most {head['budget']} Gaussians a capture; every 8th view is held "
-            "out and measured."
+            f"{self.quality}, {head['iterations']} iterations, at most {head['budget']} Gaussians a capture; every 8th "
+            "view is held out and measured."
         )
         text = f"# {self._title()}\n\n{conditions}\n\n{summary_markdown(results)}"
         text += "".join(f"- not measured: {failure}\n" for failure in failures)

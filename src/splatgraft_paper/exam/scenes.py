@@ -1,7 +1,7 @@
 """Scenes of the held-out benchmark: drawn from a number, rendered, reconstructed, and read with their truth."""
 
 import random
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -44,30 +44,34 @@ SIZE = BenchmarkSize(RenderSize(width=288, height=204, samples=8), views=18)
 _SEEDS = (2**31, 2**32)
 
 
-def draw_scenes(number: int, count: int) -> tuple[BenchmarkScene, ...]:
-    """Draw the scenes of an exam: all kinds in turn, in random order, each with a seed of the scene and of the object.
+def draw_scenes(
+    number: int, count: int, kinds: Sequence[str] = KINDS, size: BenchmarkSize = SIZE
+) -> tuple[BenchmarkScene, ...]:
+    """Draw the scenes of an exam: `kinds` in turn, in random order, each with a seed of the scene and of the object.
 
     A seed is drawn again if its scene has no room for the cameras. The first scenes do not depend on `count`.
     """
     rng = random.Random(f"exam-{number}")
-    kinds = rng.sample(KINDS, len(KINDS))
+    kinds = rng.sample(kinds, len(kinds))
     scenes: list[BenchmarkScene] = []
     while len(scenes) < count:
         kind = kinds[len(scenes) % len(kinds)]
         seeds = rng.randrange(*_SEEDS), rng.randrange(*_SEEDS)
         scene = BenchmarkScene(f"{len(scenes):02d}_{kind}", kind, *seeds)
         with suppress(ValueError):
-            plan(scene, SIZE)
+            plan(scene, size)
             scenes.append(scene)
     return tuple(scenes)
 
 
-def render_scene(which: BenchmarkScene, out: Path, blender_python: Path, *, jobs: int) -> Path:
+def render_scene(
+    which: BenchmarkScene, out: Path, blender_python: Path, *, jobs: int, size: BenchmarkSize = SIZE
+) -> Path:
     """Render what is missing of a scene into renders/ and scenes/ of `out`, and return its folder."""
     folder = out / "scenes" / which.name
     if not (folder / TRUE_LIGHT_FILE).is_file():  # this file is written last
         sides = [out / "renders" / f"{which.name}_{side}" for side in ("target", "source")]
-        planned = zip(plan(which, SIZE), sides, strict=True)
+        planned = zip(plan(which, size), sides, strict=True)
         tasks = [Task(side.name, partial(render_job, job, side, blender_python)) for job, side in planned]
         if failures := run_tasks(tasks, at_once=jobs):
             raise ValueError(failures[0])
