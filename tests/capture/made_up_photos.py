@@ -1,4 +1,4 @@
-"""Photos with known true poses, rendered by plain numpy: a textured box on a turntable before a still wall."""
+"""Photos with known true poses, rendered by plain numpy: a textured box before a still wall, or in a textured room."""
 
 from pathlib import Path
 
@@ -24,6 +24,26 @@ def turntable(folder: Path, count: int, step_deg: float, *, wall: bool = True) -
     for i, pose in enumerate(poses):
         color, hit = _box(pose, textures)
         color[~hit] = np.resize(behind, color.shape)[~hit] if wall else 0.5
+        Image.fromarray((color * 255).round().astype(np.uint8)).save(folder / "images" / f"{i:02d}.png")
+        Image.fromarray(hit).save(folder / "masks" / f"{i:02d}.png")
+    return poses
+
+
+def turned_between_series(folder: Path, counts: tuple[int, int], step_deg: float, turned_deg: float) -> np.ndarray:
+    """Write two series of photos of a box in a room, and masks of the box, which is turned between the series.
+
+    Returns:
+        World from camera (count, 4, 4), OpenCV axes, in the frame of the box.
+    """
+    (folder / "images").mkdir(parents=True)
+    (folder / "masks").mkdir()
+    generator = np.random.default_rng(0)
+    textures, walls = ([texture(generator, 512) for _ in range(6)] for _ in range(2))
+    poses = np.stack([_pose(np.deg2rad(i * step_deg)) for i in range(sum(counts))])
+    for i, pose in enumerate(poses):
+        color, hit = _box(pose, textures)
+        in_room = _about_z(np.deg2rad(turned_deg if i >= counts[0] else 0)) @ pose
+        color[~hit] = _box(in_room, walls, half=6.0, inside=True)[0][~hit]
         Image.fromarray((color * 255).round().astype(np.uint8)).save(folder / "images" / f"{i:02d}.png")
         Image.fromarray(hit).save(folder / "masks" / f"{i:02d}.png")
     return poses
@@ -55,19 +75,28 @@ def _pose(angle: float) -> np.ndarray:
     return pose
 
 
-def _box(pose: np.ndarray, textures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours (h, w, 3) and the rays' intersections with the box from -0.7 to 0.7 (slab test)."""
+def _about_z(angle: float) -> np.ndarray:
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return turn
+
+
+def _box(
+    pose: np.ndarray, textures: list[np.ndarray], *, half: float = 0.7, inside: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return colours (h, w, 3) and the rays' intersections with the box from -half to half (slab test)."""
     width, height = SIZE
     v, u = np.mgrid[0:height, 0:width] + 0.5
     rays = np.stack([(u - width / 2) / FOCAL, (v - height / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:3, :3].T
-    near, far = np.sort([(sign * 0.7 - pose[:3, 3]) / rays for sign in (-1, 1)], axis=0)
+    near, far = np.sort([(sign * half - pose[:3, 3]) / rays for sign in (-1, 1)], axis=0)
     hit = near.max(-1) < far.min(-1)
-    spots = pose[:3, 3] + near.max(-1, keepdims=True) * rays
+    depth, through = (far.min(-1), far.argmin(-1)) if inside else (near.max(-1), near.argmax(-1))
+    spots = pose[:3, 3] + depth[..., None] * rays
     color = np.zeros((height, width, 3), np.float32)
     for axis in range(3):
         for sign in (-1, 1):
-            here = hit & (near.argmax(-1) == axis) & (np.sign(-rays[..., axis]) == sign)
-            a, b = ((np.delete(spots, axis, -1) + 0.7) / 1.4 * 511).astype(np.float32).transpose(2, 0, 1)
+            here = hit & (through == axis) & (np.sign(-rays[..., axis]) == sign)
+            a, b = ((np.delete(spots, axis, -1) + half) / (2 * half) * 511).astype(np.float32).transpose(2, 0, 1)
             face = cv2.remap(textures[2 * axis + (sign > 0)], a, b, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
             color[here] = face[here]
     return color, hit

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_up_photos import FOCAL, similarity_to, turntable
+from made_up_photos import FOCAL, similarity_to, turned_between_series, turntable
 
 from splatgraft.capture import colmap_process
 from splatgraft.capture.colmap_process.job import Job
@@ -64,6 +64,23 @@ def test_an_object_on_a_turntable_is_posed_by_its_masks(tmp_path: Path) -> None:
     # a third of a pixel (SIFT) at a focal length of 500 px and a distance of 4.5 is 3 mm; hundreds of points share it,
     # while focal length and distance trade against each other: one percent of 4.5
     assert similarity_to(truth[:, :3, 3], centers)[1] < 0.045
+
+
+@pytest.mark.long
+def test_an_object_turned_between_two_series_is_posed_by_its_masks_in_a_room_that_explains_all_photos(
+    tmp_path: Path,
+) -> None:
+    truth = turned_between_series(tmp_path, (9, 9), 20, 120)
+    job = job_of(tmp_path, "masked", masks=True)
+    best = finish(job)
+    whole = json.loads((job.folder / "answers" / "global, all pairs.json").read_text())
+    assert len(whole["images"]) == 18
+    assert whole["explained"] > 0.5  # it was enough, before the object's own matches counted
+    assert whole["moved"] == [f"{i:02d}.png" for i in range(9, 18)]
+    assert best["database"] == "masked"
+    assert len(best["images"]) == 18
+    centers = np.array([image["world_from_camera"] for image in best["images"]])[:, :, 3]
+    assert similarity_to(truth[:, :3, 3], centers)[1] < 0.045  # as for the turntable
 
 
 @pytest.mark.long

@@ -58,7 +58,7 @@ def circle(count, height=1.0):
 
 def model_of(posed, photos):
     """Return the answer of the COLMAP process with this number of posed photos."""
-    unposed = [{"name": f"{i:02d}.jpg", "features": 900, "matches": 12} for i in range(posed, photos)]
+    unposed = [{"name": f"{i:02d}.jpg", "features": 900, "matches": 12, "moved": False} for i in range(posed, photos)]
     return colmap_answer([f"{i:02d}.jpg" for i in range(posed)], circle(posed), (40, 30), unposed=unposed)
 
 
@@ -110,6 +110,15 @@ def test_where_less_than_half_is_posed_all_is_done_once_more_and_the_better_mode
     assert len(posed) == 7
     assert posed.image(0).shape == (30, 40, 3)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["images", "photos", "scratch"]
+
+
+def test_a_photo_of_the_moved_object_is_left_out_and_named(tmp_path, answer):
+    moved = {"name": "07.jpg", "features": 900, "matches": 400, "moved": True}
+    answer(model_of(7, 7) | {"unposed": [moved]})
+    posed, report = pose(photo_paths(tmp_path / "photos", 8), tmp_path)
+    assert len(posed) == 7
+    assert report.missing == (Unposed("07", 900, 400, moved=True),)
+    assert "07 (the object was moved or turned against its surroundings" in str(report)
 
 
 def test_what_a_pass_posed_is_a_result_and_more_is_offered_with_its_time(tmp_path, answer):

@@ -1,6 +1,7 @@
 """Masks lifted to Gaussians, the selection by threshold, box and component, and their combination in `segment`."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -17,9 +18,11 @@ from splatgraft.segmentation import (
     SelectOptions,
     SolidifyOptions,
     lift_masks,
+    part_shares,
     segment,
     select_object,
 )
+from splatgraft.steps.segment import _part_notes
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +93,13 @@ def test_a_second_part_of_the_object_stays_unless_the_largest_alone_is_wanted(ba
     alone = select_object(both, torch.ones(2 * BALL), SelectOptions(keep="largest"))
     assert alone[:BALL].float().mean() > 0.95
     assert not alone[BALL:].any()
+    large, small = part_shares(both)
+    assert large + small == pytest.approx(1)
+    assert 0.4 < small < large
+    (note,) = _part_notes([large, small], Path("views.png"))
+    assert note.level == "warning"
+    assert f"2 separate parts, of {large:.0%} and {small:.0%}" in note.text
+    assert not _part_notes(part_shares(both.select(alone)), Path("views.png"))
 
 
 def test_threshold_is_inclusive_box_limits_the_centres_and_nothing_left_is_said(ball):

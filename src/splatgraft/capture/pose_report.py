@@ -57,9 +57,13 @@ class Unposed:
     """Number of features."""
     matches: int
     """Verified matches with the photo that matches best."""
+    moved: bool = False
+    """Whether its pose contradicts the matches on the object."""
 
     def __str__(self) -> str:
         """Return the name and the usual reason for such figures."""
+        if self.moved:
+            return f"{self.name} (the object was moved or turned against its surroundings before or after this photo)"
         if self.features < _FEW_FEATURES:
             reason = "blurred, dark or without texture"
         elif self.matches < MIN_INLIERS:

@@ -157,7 +157,7 @@ def _report(model: Mapping[str, Any], copies: Sequence[Path]) -> PoseReport:
     return PoseReport(
         photos=len(copies),
         registered=len(model["images"]),
-        missing=tuple(Unposed(Path(p["name"]).stem, p["features"], p["matches"]) for p in unposed),
+        missing=tuple(Unposed(Path(p["name"]).stem, p["features"], p["matches"], p["moved"]) for p in unposed),
         points=len(_good_points(model)),
         models=model["models"],
         method=model["method"],

@@ -20,6 +20,7 @@ from splatgraft.segmentation.selection import (
     SelectOptions,
     add_correction,
     apply_corrections,
+    part_shares,
     select_object,
 )
 from splatgraft.segmentation.solidify import SolidifyOptions, solidify_object
@@ -53,6 +54,7 @@ __all__ = [
     "load_sam2",
     "measure_agreement",
     "network_masks",
+    "part_shares",
     "seed_selection",
     "segment",
     "select_object",

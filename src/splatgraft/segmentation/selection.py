@@ -99,11 +99,28 @@ def select_object(
     return kept
 
 
+def part_shares(object_: Gaussians) -> list[float]:
+    """Compute the shares of an object's separate parts in its summed opacity, the largest part first.
+
+    Parts are connected components with at least a twentieth of the largest one's summed opacity.
+    """
+    label, opacity = _components(object_)
+    sums = np.bincount(label, weights=opacity)
+    sums = np.sort(sums[sums >= _SUBSTANTIAL * sums.max()])[::-1]
+    return [float(one) for one in sums / sums.sum()]
+
+
 def _component_opacity(gaussians: Gaussians) -> Float[Tensor, "n"]:
-    """Compute, for each Gaussian, the summed opacity of its connected component; 2-sigma spheres must touch."""
-    n = gaussians.count
+    """Compute, for each Gaussian, the summed opacity of its connected component."""
+    label, opacity = _components(gaussians)
+    return torch.from_numpy(np.bincount(label, weights=opacity)[label]).to(gaussians.means)
+
+
+def _components(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Return the number of each Gaussian's connected component, and its opacity; 2-sigma spheres must touch."""
+    n, opacity = gaussians.count, gaussians.opacities.detach().double().cpu().numpy()
     if n == 1:
-        return gaussians.opacities.detach()
+        return np.zeros(1, int), opacity
     means = gaussians.means.detach().double().cpu().numpy()
     # the median scale: a needle is long along one axis only
     radii = np.median(2 * gaussians.scales.detach().double().cpu().numpy().clip(1e-12), axis=1)
@@ -112,9 +129,7 @@ def _component_opacity(gaussians: Gaussians) -> Float[Tensor, "n"]:
     near = distance <= radii[:, None] + radii[neighbour]
     rows = np.broadcast_to(np.arange(n)[:, None], near.shape)[near]
     graph = coo_array((np.ones(len(rows), bool), (rows, neighbour[near])), shape=(n, n))
-    _, label = connected_components(graph, directed=False)
-    opacity = np.bincount(label, weights=gaussians.opacities.detach().double().cpu().numpy())
-    return torch.from_numpy(opacity[label]).to(gaussians.means)
+    return connected_components(graph, directed=False)[1], opacity
 
 
 def apply_corrections(lifted: Bool[Tensor, "n"], corrections: Int8[Tensor, "n"] | None) -> Bool[Tensor, "n"]:

@@ -55,6 +55,7 @@ from splatgraft.segmentation import (
     load_sam2,
     measure_agreement,
     network_masks,
+    part_shares,
     select_object,
     solidify_object,
     widest_gap,
@@ -65,6 +66,7 @@ AGREEMENT_FILE = "agreement.json"
 SOLID_SIDE_PX = 960
 """Longest side of the photos that the object is fitted to; time and memory grow with their area."""
 _PICTURED = 8  # photographs on the sheet
+_SEPARATE = 0.1  # share of the object's opacity; warn if a separate part has more
 _MUCH_GUESSED = 0.1  # share of the surface; warn if more was never photographed
 
 
@@ -246,6 +248,7 @@ class Segment:
         chosen = [*doubtful, *(i for i in dict.fromkeys(others) if i not in doubtful)][:_PICTURED]
         write_mask_sheet(folder / SHEET_FILE, masked, chosen, scene=scene, selection=selection)
         context.console.tell(*_agreement_notes(agreement, self.out / SHEET_FILE, folder / SHEET_FILE))
+        context.console.tell(*_part_notes(part_shares(scene.select(selection)), folder / SHEET_FILE))
 
 
 def _small_masks(masked: MaskedViews) -> tuple[Cameras, Sequence[Tensor]]:
@@ -261,6 +264,16 @@ def _photographs(masked: MaskedViews) -> tuple[PosedImages, Sequence[tuple[Tenso
     sizes = views.cameras.sizes.tolist()
     read = LazySequence(len(sizes), lambda index: (views.image(index), resize(masked.masks[index], *sizes[index])))
     return views, read
+
+
+def _part_notes(shares: Sequence[float], picture: Path) -> list[Note]:
+    """Warn if the object is in several parts, because an object that was moved between photos appears twice."""
+    large = [f"{share:.0%}" for share in shares if share > _SEPARATE]
+    if len(large) < 2:
+        return []
+    text = f"the object is in {len(large)} separate parts, of {' and '.join(large)} of it."
+    remedy = "If it is one thing, remove the photos before or after it was moved, or keep only the largest part (keep)"
+    return [Note(text, "warning", remedy, picture)]
 
 
 def _agreement_notes(agreement: Agreement, sheet: Path, picture: Path) -> list[Note]:

@@ -6,6 +6,9 @@ The search tries, in this order, until a model is good enough:
 2. the same pairs, with the features inside the masks;
 3. more pairs, with the features that gave the better model.
 
+If there are masks, only photos count whose poses explain the object's own matches. So a background that moved against
+the object does not decide, even if it explains all photos.
+
 The global mapper makes the models (GLOMAP: Pan et al. 2024, Global Structure-from-Motion Revisited), because it
 averages the rotations of all pairs. The incremental mapper starts from one pair. If the matches of this pair lie on a
 plane, its pose can be wrong at a small error, and the shared lens is then distorted until the other photos fit.
@@ -31,7 +34,7 @@ from .database import (
 )
 from .job import Clock, Job, say
 from .refinement import refined
-from .scores import Answer, best_of, connected_photos, unposed
+from .scores import Answer, best_of, connected_photos, moved_photos, unposed
 
 _ALL, _MASKED = "photos", "masked"  # names of the databases with all features, and with those inside the masks
 _ENOUGH_PHOTOS = 0.9  # smallest share of photos with a pose at which the search may end
@@ -46,9 +49,13 @@ def main(words: dict[str, Any]) -> None:
     pycolmap.set_random_seed(job.seed)
     with clock.phase("features"):
         find_features(job)
-    best = _search(job, clock)
+    best = _without_moved(_search(job, clock))
     times = {"seconds": clock.seconds, "cpu_seconds": clock.cpu_seconds}
     _write(job.output, best | {"unposed": unposed(_database(job, _ALL), best)} | times)
+
+
+def _without_moved(best: Answer) -> Answer:
+    return best | {"images": [image for image in best["images"] if image["name"] not in best["moved"]]}
 
 
 def _end_with_parent() -> None:
@@ -74,8 +81,11 @@ def _search(job: Job, clock: Clock) -> Answer:
         database = _database(job, name)
         with clock.phase("matching"):
             clock.pairs += match(job, database, level)
+            if job.masks and name != _MASKED:
+                copy_with_features(database, _database(job, _MASKED), inside_masks(job, database))
+                match(job, _database(job, _MASKED), level)
         answers.append(_answer(job, clock, name, level))
-        posed = len(answers[-1]["images"])
+        posed = _agreeing(answers[-1])
         # before the last level, photos without matches may still get some from more pairs
         return (
             answers[-1]["explained"] >= _CLEAR_EXPLAINED
@@ -88,13 +98,11 @@ def _search(job: Job, clock: Clock) -> Answer:
         return _best(answers)
     if job.masks:
         say(f"{_shortfall(answers, job)}: trying again with only the features inside the masks")
-        all_features = _database(job, _ALL)
-        copy_with_features(all_features, _database(job, _MASKED), inside_masks(job, all_features))
         if is_enough_after(_MASKED, first):
             return _best(answers)
     for level in further:
         best = _best(answers)
-        if len(best["images"]) >= _ENOUGH_PHOTOS * len(job.names):
+        if _agreeing(best) >= _ENOUGH_PHOTOS * len(job.names):
             break
         pairs, seconds = unmatched_pairs(job, _database(job, best["database"])), clock.seconds_per_pair
         time = f", about {max(1, round(pairs * seconds / 60))} min" if seconds else ""
@@ -120,6 +128,7 @@ def _answer(job: Job, clock: Clock, name: str, level: str) -> Answer:
         with clock.phase("refinement"):
             better = [refined(job, work, models)] if models else []
         found = best_of(matched, [*models, *better], len(job.names))
+        found["moved"] = moved_photos(_database(job, _MASKED), found) if job.masks else []
         _write(path, found | {"models": len(models), "method": method, "database": name})
     return json.loads(path.read_text())
 
@@ -133,13 +142,19 @@ def _best(answers: list[Answer]) -> Answer:
     best: dict[str, Answer] = {}
     for answer in sorted(answers, key=lambda answer: (answer["database"] == _MASKED, -answer["score"])):
         best.setdefault(answer["database"], answer)
-    return max(best.values(), key=lambda answer: len(answer["images"]) * min(answer["explained"], _CLEAR_EXPLAINED))
+    return max(best.values(), key=lambda answer: _agreeing(answer) * min(answer["explained"], _CLEAR_EXPLAINED))
+
+
+def _agreeing(answer: Answer) -> int:
+    """Count the photos with a pose that does not contradict the matches on the object."""
+    return len(answer["images"]) - len(answer["moved"])
 
 
 def _shortfall(answers: list[Answer], job: Job) -> str:
     """Describe the best model so far by photos and explained matches."""
     best = _best(answers)
-    return f"{len(best['images'])} of {len(job.names)} photos, {best['explained']:.0%} of matches explained"
+    moved = f", {len(best['moved'])} more contradict the object's matches" if best["moved"] else ""
+    return f"{_agreeing(best)} of {len(job.names)} photos{moved}, {best['explained']:.0%} of matches explained"
 
 
 def _global_models(job: Job, database: Path) -> list[Any]:

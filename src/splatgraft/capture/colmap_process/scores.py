@@ -5,6 +5,7 @@ explained if both its features see the same point, and if at least `MIN_TRACK` p
 of at most `MAX_ERROR_PX`. Unlike the reprojection error, the score counts the matches that COLMAP dropped.
 """
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ import numpy as np
 import pycolmap
 
 from .job import MAX_ERROR_PX, MIN_INLIERS, MIN_TRACK
+
+_EPIPOLAR_PX = 4.0  # largest Sampson error of a match that two poses explain (COLMAP: max_error of a pair)
+_AGREED = 0.5  # smallest share of the object's matches that the poses of a pair explain if they are right
 
 ALIKE = 0.99
 """Smallest ratio of a score to the best one at which two models count as equally good."""
@@ -63,6 +67,66 @@ def explained_shares(matches: Matches, model: Any) -> dict[int, float]:
             for i in (a, b):
                 counts[i] += (_explained(seen, a, b, rows), len(rows))
     return {i: float(explained / total) for i, (explained, total) in counts.items() if total}
+
+
+def moved_photos(database: Path, answer: Answer) -> list[str]:
+    """Find photos whose poses contradict the matches on the object, because it was moved or turned between photos.
+
+    Two photos agree on the object if their poses explain half of its matches. Photos that agree, directly or through
+    others, are a group. A group contradicts the largest one if it does not agree with a photo of it that has enough
+    matches. Photos with too few matches on the object contradict nothing.
+
+    Args:
+        database: Verified matches of the features inside the masks.
+        answer: The model.
+
+    Returns:
+        Names of the photos of all groups that contradict the largest one.
+    """
+    posed = {image["name"]: image for image in answer["images"]}
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images() if image.name in posed}
+        rays = {i: _rays(posed[name]["camera"], opened.read_keypoints(i)[:, :2]) for i, name in names.items()}
+    group = {i: i for i in names}
+
+    def root(i: int) -> int:
+        while group[i] != i:
+            i = group[i]
+        return i
+
+    apart: list[tuple[int, int]] = []
+    for a, b, rows in read_matches(database):
+        if a not in names or b not in names or len(rows) < MIN_INLIERS:
+            continue
+        errors = _sampson_px(posed[names[a]], posed[names[b]], rays[a][rows[:, 0]], rays[b][rows[:, 1]])
+        if (errors <= _EPIPOLAR_PX).mean() >= _AGREED:
+            group[root(a)] = root(b)
+        else:
+            apart.append((a, b))
+    sizes = Counter(root(i) for i in names)
+    largest = max(sizes, key=lambda i: (sizes[i], -i), default=0)
+    against = {root(pair[0]) for pair in apart} | {root(pair[1]) for pair in apart}
+    against &= {root(b if root(a) == largest else a) for a, b in apart if largest in (root(a), root(b))}
+    return sorted(names[i] for i in names if root(i) in against - {largest})
+
+
+def _rays(camera: list[float], keypoints: np.ndarray) -> np.ndarray:
+    """Compute the directions (n, 3) of pixels, scaled to depth 1."""
+    opencv = pycolmap.Camera(model="OPENCV", width=1, height=1, params=camera)
+    flat = opencv.cam_from_img(np.asarray(keypoints, np.float64))
+    return np.concatenate([flat, np.ones((len(flat), 1))], 1)
+
+
+def _sampson_px(one: dict[str, Any], other: dict[str, Any], rays: np.ndarray, matched: np.ndarray) -> np.ndarray:
+    """Compute the Sampson errors of matches under the poses of two photos, pixels."""
+    first, second = (np.array(image["world_from_camera"]) for image in (one, other))
+    rotation = second[:, :3].T @ first[:, :3]
+    x, y, z = second[:, :3].T @ (first[:, 3] - second[:, 3])
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    lines, back = rays @ essential.T, matched @ essential
+    slopes = (lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
+    errors = np.abs((matched * lines).sum(1)) / np.sqrt(np.maximum(slopes, 1e-30))
+    return errors * min(one["camera"][0], other["camera"][0])
 
 
 def connected_photos(database: Path) -> int:
@@ -129,7 +193,7 @@ def lens_numbers(camera: Any) -> list[float]:
 
 
 def unposed(database: Path, answer: Answer) -> list[dict[str, Any]]:
-    """Return name, number of features and most matches with one other photo, for each photo without a pose."""
+    """Return name, features, most matches with one other photo and whether it was moved, for photos without a pose."""
     posed = {image["name"] for image in answer["images"]}
     most: dict[int, int] = {}
     for *pair, rows in read_matches(database):
@@ -141,6 +205,7 @@ def unposed(database: Path, answer: Answer) -> list[dict[str, Any]]:
                 "name": image.name,
                 "features": opened.num_keypoints_for_image(image.image_id),
                 "matches": most.get(image.image_id, 0),
+                "moved": image.name in answer["moved"],
             }
             for image in sorted(opened.read_all_images(), key=lambda image: image.name)
             if image.name not in posed
