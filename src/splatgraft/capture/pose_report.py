@@ -17,6 +17,8 @@ POSE_REPORT_FILE = "pose_report.json"
 
 _FEW_FEATURES = 500  # most photos have thousands, one in ten of them matches in the next photo
 
+_NAMED = 3  # most photos named per reason; the file has all
+
 # plausible ranges of the figures
 _MIN_REGISTERED = 0.7  # share of photos with a pose; a result with fewer is usable, but a third is missing
 _MIN_EXPLAINED = 0.5  # explained share of verified matches; the shipped room, vase and bananas have 0.59 to 0.87
@@ -60,17 +62,16 @@ class Unposed:
     moved: bool = False
     """Whether its pose contradicts the matches on the object."""
 
-    def __str__(self) -> str:
-        """Return the name and the usual reason for such figures."""
+    @property
+    def reason(self) -> str:
+        """The usual reason for such figures."""
         if self.moved:
-            return f"{self.name} (the object was moved or turned against its surroundings before or after this photo)"
+            return "the object was moved or turned against its surroundings"
         if self.features < _FEW_FEATURES:
-            reason = "blurred, dark or without texture"
-        elif self.matches < MIN_INLIERS:
-            reason = "shows another place, or is too far from the next photo"
-        else:
-            reason = "something moved, is mirrored or repeats itself, or a photo between two views is missing"
-        return f"{self.name} ({self.features} features, at most {self.matches} matches: {reason})"
+            return "blurred, dark or without texture"
+        if self.matches < MIN_INLIERS:
+            return "another place, or too far from the next photo"
+        return "something moved, is mirrored or repeats itself, or a photo between two views is missing"
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,18 @@ class PoseReport:
         alone = [lens.photos[0] for lens in self.lenses if len(lens.photos) == 1]
         if alone and len(alone) < len(self.lenses):
             line += f"; photos with their own camera: {', '.join(alone)}"
-        return line + (f"; without a pose: {', '.join(map(str, self.missing))}" if self.missing else "")
+        return line + (f"; without a pose: {self.reasons}" if self.missing else "")
+
+    @property
+    def reasons(self) -> str:
+        """The reasons against the photos without a pose, each with its number of photos and the first names."""
+        names: dict[str, list[str]] = {}
+        for photo in self.missing:
+            names.setdefault(photo.reason, []).append(photo.name)
+        return "; ".join(
+            f"{len(those)} ({', '.join(those[:_NAMED])}{' ...' if len(those) > _NAMED else ''}: {reason})"
+            for reason, those in sorted(names.items(), key=lambda one: -len(one[1]))
+        )
 
 
 def find_doubts(

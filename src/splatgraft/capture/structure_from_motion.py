@@ -128,7 +128,7 @@ def pose_photos(
     if report.registered < MIN_POSED_SHARE * len(copies):
         raise ValueError(
             f"{photos.paths[0].parent}: expected at least half of {len(copies)} photos to register, "
-            f"found {report.registered}; {_ADVICE}; without a pose: {', '.join(map(str, report.missing))}"
+            f"found {report.registered}; {_ADVICE}; without a pose: {report.reasons}"
         )
     progress(total - 1, total, "undistorting")
     posed, on_their_side = _posed_images(model, copies[0].parent, masks, workspace)
