@@ -84,7 +84,9 @@ def test_what_was_mended_is_noted_and_is_not_what_helps_most(
     (name, first), (_, second), *_ = flow
     left_out = Note("One photo is blurred.", "minor")
     doubt = Note("Half of it is fog.", "warning", "leave the photo out")
-    for step, warnings in ((first, (left_out, left_out)), (second, (doubt,))):
+    worst = Note("The back is a guess.", "warning", "photograph the back too", Path("coverage.png"))
+    last = next(step for name, step in flow if name == "segment")
+    for step, warnings in ((first, (left_out, left_out)), (second, (doubt,)), (last, (worst,))):
         step.out.mkdir(parents=True)
         record = Record(type(step).__name__.lower(), "0", {}, {}, (), 0.0, 0, warnings)
         write_record(step.out, record)
@@ -92,8 +94,12 @@ def test_what_was_mended_is_noted_and_is_not_what_helps_most(
     assert lines[0] == f"noted: {name}: One photo is blurred. (and 1 more)"
     assert lines[1].startswith("unsure: ")
     assert lines[1].endswith("Half of it is fog.")
-    assert lines[2] == "helps most: leave the photo out"
-    write_record(second.out, replace(record, warnings=()))
+    assert lines[2] == "unsure: segment: The back is a guess."
+    # what the picture shows first, although another step comes first
+    assert lines[3] == f"worst: The back is a guess. ({last.out / 'coverage.png'})"
+    assert lines[4] == "helps most: photograph the back too"
+    for step in (second, last):
+        write_record(step.out, replace(record, warnings=()))
     assert refinements(flow, tmp_path / "p")[1].startswith("no step warned")
 
 

@@ -3,6 +3,7 @@
 import re
 import shlex
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -15,8 +16,12 @@ from splatgraft.project.step import Positional, Step, default_remedy
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.note import Note
 from splatgraft.runtime.process import open_page
 from splatgraft.runtime.settings import read_toml
+from splatgraft.steps.capture import Capture
+from splatgraft.steps.compose import Compose
+from splatgraft.steps.relight import Relight
 from splatgraft.steps.segment import Segment
 from splatgraft.workflow.flow import Flow, read_flow
 from splatgraft.workflow.run import run_steps
@@ -96,31 +101,47 @@ class Try:
 
 
 def refinements(flow: Flow, folder: Path) -> list[str]:
-    """List the doubts about each step of a finished project, the best remedy, and how to get finer results."""
+    """List the doubts about each step of a finished project, the worst one with its remedy, and how to get finer
+    results."""
     shown = Path(shlex.quote(str(folder)))
     lines: list[str] = []
-    helps: list[str] = []
+    doubts: list[tuple[Step, Note]] = []
     for name, step in flow:
         record = read_record(step.out)
         if record is None:
             continue
         mended = [note.text for note in record.warnings if not note.in_doubt]
-        doubts = [*_guesses(step), *(note.text for note in record.warnings if note.in_doubt)]
+        own = [*_guesses(step), *(note for note in record.warnings if note.in_doubt)]
+        doubts += [(step, note) for note in own]
         if mended:
             lines.append(f"noted: {name}: {mended[0]}{_more(mended)}")
-        if not doubts:
-            continue
-        lines.append(f"unsure: {name}: {doubts[0]}{_more(doubts)}")
-        remedies = [note.remedy for note in record.warnings if note.in_doubt and note.remedy]
-        helps += remedies[:1] or [default_remedy(step)]
-    # later steps build on earlier ones, so the first doubt is the one to mend
-    if not any(line.startswith("unsure: ") for line in lines):
+        if own:
+            lines.append(f"unsure: {name}: {own[0].text}{_more(own)}")
+    if doubts:
+        step, note = min(doubts, key=lambda one: _rank(*one))
+        picture = f" ({step.out / note.picture})" if note.picture else ""
+        lines.append(f"worst: {note.text}{picture}")
+        remedy = note.remedy or default_remedy(step)
+    else:
         lines.append("no step warned of its result: look at the pictures; the cut of the object is mended most often")
-        helps = [Segment.remedy]
-    lines.append(f"helps most: {next(filter(None, helps), '').replace('PROJECT', str(shown))}")
+        remedy = Segment.remedy
+    if remedy:
+        lines.append(f"helps most: {remedy.replace('PROJECT', str(shown))}")
     quality = _FINER.get(_quality(folder / PROJECT_FILE) or "")
     finer = f'finer: quality = "{quality}" under [reconstruct] in {shown / PROJECT_FILE}, then splatgraft run {shown}'
     return [*lines, *([finer] if quality else [])]
+
+
+def _rank(step: Step, note: Note) -> tuple[int, bool]:
+    """Rank a doubt by what it costs in the picture, the worst first.
+
+    Wrong poses spoil all. Then come the object and its light, which the picture shows first, and its place. A guess
+    without a remedy comes after the step's measured faults.
+    """
+    if isinstance(step, Capture):
+        return (0 if note.text.startswith(f"{step.capture}: doubtful") else 4), not note.remedy
+    order = (Segment, Relight, Compose)
+    return next((1 + i for i, kind in enumerate(order) if isinstance(step, kind)), 4), not note.remedy
 
 
 def _quality(project: Path) -> str | None:
@@ -129,17 +150,18 @@ def _quality(project: Path) -> str | None:
     return None if "scene" in content["target"] else content.get("reconstruct", {}).get("quality")
 
 
-def _more(sentences: list[str]) -> str:
-    return f" (and {len(sentences) - 1} more)" if len(sentences) > 1 else ""
+def _more(some: Sequence[object]) -> str:
+    return f" (and {len(some) - 1} more)" if len(some) > 1 else ""
 
 
-def _guesses(step: Step) -> list[str]:
+def _guesses(step: Step) -> list[Note]:
     """List the guesses of a step that the user gave no masks or clicks."""
     if not isinstance(step, Segment):
         return []
     if (step.out / "masks").is_dir() and step.box is None and step.prompts is None:
-        return ["no masks and no clicks were given: the object is assumed to stand where the cameras look."]
-    return ["the object is everything inside a box; masks cut it more precisely."] if step.mask_source == "box" else []
+        return [Note("no masks and no clicks were given: the object is assumed to stand where the cameras look.")]
+    text = "the object is everything inside a box; masks cut it more precisely."
+    return [Note(text)] if step.mask_source == "box" else []
 
 
 def _name(capture: Path) -> str:

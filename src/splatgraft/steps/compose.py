@@ -107,7 +107,7 @@ class Compose:
                 f"{unseen:.0%} of the target's images show a side of the object that none of its photos shows: red in "
                 "the picture, seen from above; dark dots are its photos, blue ones the target's images."
             )
-            remedy = "Turn it (--yaw-deg), place it before a wall, or photograph it from there too."
+            remedy = "Turn the object (--yaw-deg), put it before a wall, or photograph that side of it too."
             context.console.tell(Note(text, "warning", remedy, picture=folder / COVERAGE_FILE))
         return Placement(objects=(ObjectPlacement(target_from_object=placed.target_from_object),))
 

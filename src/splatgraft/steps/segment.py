@@ -229,7 +229,7 @@ class Segment:
             text += " The picture shows the directions around it from above, with its photos as dark dots."
             if gap > WIDE_GAP_DEG:
                 text += f" No photo was taken over {gap:.0f} degrees around it, between {first} and {last}."
-            remedy = "Photograph it from there too, or turn that side away (compose: yaw_deg)"
+            remedy = "Photograph that side of the object too, or turn it away from the cameras (compose: yaw_deg)"
             context.console.tell(Note(text, "warning", remedy, picture=folder / COVERAGE_FILE))
         elif share > 0:
             context.console.tell(Note(text))
