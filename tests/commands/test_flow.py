@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -26,6 +27,7 @@ from splatgraft.project.record import read_record, why_stale
 from splatgraft.project.step import FolderCheckpoint, job_of, replacing
 from splatgraft.runtime.settings import choices, field_types
 from splatgraft.steps.harmonize import Harmonize
+from splatgraft.workflow import capture_ahead, run
 from splatgraft.workflow.flow import read_flow
 
 STEPS = ("segment", "compose", "relight", "render", "harmonize", "consolidate", "evaluate")
@@ -197,6 +199,41 @@ def test_views_of_a_ground_truth_that_no_step_saw_are_measured_apart(project: Pa
     assert metrics["views"] == "held out"
     assert metrics["view_count"] == 1
     assert [row["held_out"] for row in metrics["per_view"]] == [True] + [False] * 7
+
+
+def test_a_later_capture_is_made_by_a_second_process_and_its_failure_is_the_steps_own(
+    project: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capture_ahead, "_WORTHWHILE_SECONDS", -1.0)
+    performed, processes = [], []
+    perform, finish = run.perform, capture_ahead.CaptureAhead.finish
+
+    def performing(step: Any, console: Any, *, name: str) -> Path:
+        performed.append(name)
+        return perform(step, console, name=name)
+
+    def finishing(self: capture_ahead.CaptureAhead, console: Any) -> None:
+        processes.append(self.process)
+        finish(self, console)
+
+    monkeypatch.setattr(run, "perform", performing)
+    monkeypatch.setattr(capture_ahead.CaptureAhead, "finish", finishing)
+    flow = read_flow(project)
+    before = contents(flow.steps["target/capture"].out)
+    for side in ("source", "target"):
+        shutil.rmtree(flow.steps[f"{side}/capture"].out)
+    assert main(["run", str(project), "--to", "capture"]) == 0
+    assert performed == ["source/capture"]
+    (process,) = processes
+    assert process.pid != os.getpid()
+    assert process.returncode == 0
+    assert contents(flow.steps["target/capture"].out) == before
+    said = capsys.readouterr().err
+    assert said.index("source/capture       done") < said.index("target/capture       done")
+    # the second process fails, and this one gives the reason
+    shutil.rmtree(project.parents[1] / "photos" / "target" / "images")
+    assert main(["run", str(project), "--to", "capture", "--force", "capture"]) == 2
+    assert str(project.parents[1] / "photos" / "target") in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_no_masks_are_cut_from_the_images_and_the_choice_is_said(

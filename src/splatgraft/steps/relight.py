@@ -30,7 +30,9 @@ from splatgraft.runtime.note import Note
 class Relight:
     """Light the object by its new place and add its shadow to the place; no training, no images."""
 
-    remedy: ClassVar[str] = "turn the arrow of the light to where the light comes from: splatgraft edit PROJECT, step Light"
+    remedy: ClassVar[str] = (
+        "turn the arrow of the light to where the light comes from: splatgraft edit PROJECT, step Light"
+    )
 
     target: Path
     """The scene that receives the object, a .ply."""

@@ -9,6 +9,7 @@ from splatgraft.project.step import clear_leftovers, job_of, locked, perform
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import is_writable
 from splatgraft.steps.capture import Capture, doubt_about
+from splatgraft.workflow.capture_ahead import captures_ahead
 from splatgraft.workflow.flow import read_flow, reasons
 from splatgraft.workflow.time_estimate import describe_estimate, estimate_step_times
 
@@ -37,15 +38,19 @@ def run_steps(
         planned = estimate_step_times(flow, [name for name in wanted if name in forced or why[name] is not None])
         if planned:
             console.say(describe_estimate(planned))
-        for name, step in wanted.items():
-            reason = "asked for" if name in forced else why_stale(job_of(step))
-            console.say(f"{name:<20} {reason or 'up to date'}")
-            if reason:
-                perform(step, console, name=name)
-            elif is_writable(step.out.parent):
-                clear_leftovers(step.out)
-            if isinstance(step, Capture) and not accept_doubtful and (doubt := doubt_about(step)):
-                raise ValueError(doubt)
+        with captures_ahead(flow, project, out, planned) as begun:
+            for name, step in wanted.items():
+                reason = "asked for" if name in forced else why_stale(job_of(step))
+                console.say(f"{name:<20} {reason or 'up to date'}")
+                if name in begun:
+                    begun[name].finish(console)
+                    reason = why_stale(job_of(step))
+                if reason:
+                    perform(step, console, name=name)
+                elif is_writable(step.out.parent):
+                    clear_leftovers(step.out)
+                if isinstance(step, Capture) and not accept_doubtful and (doubt := doubt_about(step)):
+                    raise ValueError(doubt)
     console.say("results:")
     layout = flow.layout
     for name, path in (("consolidate", layout.result / SCENE_FILE), ("evaluate", layout.report / REPORT_FILE)):
