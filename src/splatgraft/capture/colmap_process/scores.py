@@ -113,8 +113,9 @@ def moved_photos(database: Path, answer: Answer) -> list[str]:
 def _rays(camera: list[float], keypoints: np.ndarray) -> np.ndarray:
     """Compute the directions (n, 3) of pixels, scaled to depth 1."""
     opencv = pycolmap.Camera(model="OPENCV", width=1, height=1, params=camera)
-    flat = opencv.cam_from_img(np.asarray(keypoints, np.float64))
-    return np.concatenate([flat, np.ones((len(flat), 1))], 1)
+    rays = np.ones((len(keypoints), 3))
+    rays[:, :2] = opencv.cam_from_img(np.asarray(keypoints, np.float64))
+    return rays
 
 
 def _sampson_px(one: dict[str, Any], other: dict[str, Any], rays: np.ndarray, matched: np.ndarray) -> np.ndarray:
