@@ -179,6 +179,20 @@ def test_a_cloth_with_folds_is_level_ground():
     assert found.obstructed_fraction < 0.05
 
 
+def test_the_slope_of_a_cloth_s_edge_does_not_tilt_and_a_slope_all_around_does():
+    cloth = sheet((0, 0, TABLE), (0.42, 0, 0), (0, 0.4, 0), spacing=0.01, noise=0.001)
+    # its edge hangs by 15 degrees
+    drop = math.tan(math.radians(15)) * (cloth.means[:, 0] - 0.3).clamp_min(0)
+    hanging = replace(cloth, means=cloth.means - drop[:, None] * UP)
+    found = support_below(hanging, torch.tensor([0.36, 0, TABLE]), up=UP, radius=0.05)
+    assert math.degrees(math.acos(min(1.0, float(found.normal @ UP)))) < 2
+    assert float(found.point[2]) == pytest.approx(TABLE - 0.06 * math.tan(math.radians(15)), abs=0.01)
+    assert found.flat_fraction < 0.9  # a level place comes before it
+    slope = replace(cloth, means=cloth.means - 0.2 * cloth.means[:, :1] * UP)
+    found = support_below(slope, torch.tensor([0.1, 0, TABLE]), up=UP, radius=0.05)
+    assert float(found.normal[0] / found.normal[2]) == pytest.approx(0.2, abs=0.02)
+
+
 def test_support_beside_the_table_is_the_floor_and_nothing_below_is_said():
     found = support_below(room(), torch.tensor([-1.2, 1.0, 1.0]), up=UP, radius=0.15)
     assert abs(float(found.point[2])) < 0.01

@@ -4,6 +4,7 @@ The height map is the median depth from straight above, without Gaussians above 
 least squares to points that are ever nearer to it.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -86,6 +87,8 @@ _TOLERANCES = (0.3, 0.2, 0.12, 0.08, 0.06, 0.06)
 _ON_SURFACE = _TOLERANCES[-1]  # largest distance of a point from the level plane that is fitted to it
 _LEVEL = 0.15  # distance from the plane within which ground is level, folds of a cloth included; higher things obstruct
 _MAX_ERROR = 0.12  # bound on the distance of a point in the comparison of a sloped plane with a level one
+_AROUND = 6.0  # radius of the disc whose slope counts if the smaller one's differs, as at the edge of a cloth
+_SAME_SLOPE = math.cos(math.radians(4.0))  # smallest cosine between two slopes that count as one
 _SLOPE_GAIN = 0.7  # largest error of the sloped plane over that of the level one; a slope that explains less is noise
 
 
@@ -113,7 +116,8 @@ def support_below(
 ) -> Support:
     """Find the level surface that fills most of a horizontal disc below a point.
 
-    On a heap of things or a steep slope the surface is poor, and its `flat_fraction` low.
+    On a heap of things or a steep slope the surface is poor, and its `flat_fraction` low. A slope that the ground
+    around the disc does not share, such as that of a cloth's edge, does not tilt the plane.
 
     Args:
         scene: The scene with the surface.
@@ -141,6 +145,13 @@ def support_below(
         raise ValueError(f"placement: expected a surface below ({where}), found none; name another point")
     points = ground.points[solid] - point
     normal, height = _fit_level_plane(points, ground.heights[solid], up=up, radius=radius)
+    if not torch.equal(normal, up):
+        wide = height_map(scene, point, up=up, radius=_AROUND * radius, top=top, size=_DISC_SIZE_PX)
+        held = wide.alpha > 0.5
+        around, _ = _fit_level_plane(wide.points[held] - point, wide.heights[held], up=up, radius=radius)
+        if float(around @ normal) < _SAME_SLOPE:
+            height = (points[(points @ normal - height).abs() < _ON_SURFACE * radius] @ around).median()
+            normal = around
     rise = (points @ normal - height) / radius
     return Support(
         point=point + up * height / (normal @ up),
