@@ -36,7 +36,14 @@ from splatgraft.relighting.light.panorama import (
     render_panorama,
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
-from splatgraft.relighting.light.sun import SET_BY_HAND, direction_through, find_sun, set_sun, with_sun
+from splatgraft.relighting.light.sun import (
+    SET_BY_HAND,
+    _find_sun_within,
+    direction_through,
+    find_sun,
+    set_sun,
+    with_sun,
+)
 from splatgraft.relighting.light.sun_by_clock import BY_CLOCK, find_sun_by_clock
 
 
@@ -410,6 +417,32 @@ def test_a_clock_decides_between_shadows_and_does_not_overrule_clear_ones():
         assert found.evidence < alone.evidence + 0.1
     # among directions that the shadows show almost as well, one nearer to the clock's is taken
     assert degrees_apart(by_clock.direction, near) < degrees_apart(alone.direction, near)
+
+
+def test_beside_a_clock_that_agrees_fainter_shadows_show_the_sun():
+    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+    noise = torch.randn(20000, generator=torch.Generator().manual_seed(3))
+    scene = sunlit_scene(sun, 3.0)
+    scene = painted(scene, lambda means: noise[: len(means)].exp())
+    # one shadow, cut off by the region's edge, on a floor whose texels differ by a factor of e
+    region = BoundingSphere(torch.tensor([1.8, 0.0, 0.3]), 0.8)
+    wrong = torch.nn.functional.normalize(torch.tensor([-0.6, 0.5, 0.5]), dim=0)
+    found = [_find_sun_within(CapturedScene(scene, views(), clock), region, 40.0) for clock in (None, clock_at(wrong))]
+    assert found == [None, None]
+    by_clock = _find_sun_within(CapturedScene(scene, views(), clock_at(sun)), region, 40.0)
+    assert by_clock is not None
+    assert degrees_apart(by_clock.direction, sun) < 12
+    assert 10 < by_clock.evidence < 40
+
+
+@pytest.mark.parametrize("place", [(1.5, -1.5, 0.05), (-1.8, -1.6, 0.05)])
+def test_shadows_far_from_a_small_object_show_the_sun(place):
+    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+    small = BoundingSphere(torch.tensor(place), 0.06)
+    found = estimate_light(CapturedScene(sunlit_scene(sun, 3.0), views()), small)
+    assert isinstance(found, EstimatedLight)
+    assert found.sun is not None
+    assert degrees_apart(found.sun.direction, sun) < 3
 
 
 def test_shading_and_highlights_show_how_strong_the_sun_of_the_clock_is():

@@ -8,9 +8,10 @@
 3. Compare differences of log luminance between texels a few texels apart in the picture with the differences that sun
    and other light predict. The density of a difference is a Cauchy density, because texels also differ by material. It
    is mixed with the chance that something unseen shades a texel, or a whole tile of the picture.
-4. Add the log density of the direction by the clock of the photos, if there is one. It chooses between directions; the
-   shadows alone decide whether there is a sun.
+4. Add the log density of the direction by the clock of the photos, if there is one: where the sun must be is known, so
+   that fainter shadows show it.
 5. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
+6. If no direction is decisively better than no sun, do the same in a wider region.
 
 `set_sun` searches in the same way near the direction of points that a user marks together with their shadows.
 """
@@ -63,6 +64,7 @@ _APART = math.cos(math.radians(8.0))  # cosine of the minimum angle between two 
 _SPANS = ((3.0, 1.0), (1.0, 0.33))  # half width and step of the grids around a maximum, degrees
 _PROMISING = 10.0  # log likelihood over that of even light above which a direction of the search is refined
 _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
+_WIDER = 3.0  # radius of the second region: few things stand near a small object, but the sun is the same
 _TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a prior, because texels share their errors
 _CLOCK_IS_WRONG = 0.05  # probability that no candidate of the clock is the sun
 _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
@@ -327,7 +329,7 @@ class _ShadowEvidence:
         """Select the directions above the surface."""
         return directions[directions @ self.surface.plane.normal > _LOWEST]
 
-    def best(self, directions: Float[Tensor, "k 3"], log_prior: LogPrior) -> tuple[Float[Tensor, "3"], float]:
+    def best(self, directions: Float[Tensor, "k 3"], log_prior: LogPrior) -> tuple[Float[Tensor, "3"], float, float]:
         """Find the sun's most probable direction.
 
         Args:
@@ -335,7 +337,8 @@ class _ShadowEvidence:
             log_prior: Log density of directions.
 
         Returns:
-            The direction, and the log likelihood of its shadows over that of no sun; -inf if no direction is promising.
+            The direction; the log likelihood of its shadows over that of no sun, -inf if no direction is promising; and
+            this with the log prior.
         """
         coarse, fine = _Comparison.of(self.picture, _COARSE), _Comparison.of(self.picture, _FINE)
         every, surface = coarse.every, self.surface
@@ -358,25 +361,38 @@ class _ShadowEvidence:
                 mode = near[i]
                 if float(posterior[i]) > likeliest:
                     best, likeliest, evidence = mode, float(posterior[i]), float(found[i])
-        return best, evidence
+        return best, evidence, likeliest
 
 
 def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float = _DECISIVE) -> Sun | None:
-    """Find the sun whose shadows a level surface shows.
+    """Find the sun whose shadows a level surface shows, in the region or else in a wider one.
+
+    Without a clock, the wider region is at most as large as the cameras' distance: there is none around an object that
+    fills the views.
 
     Args:
         captured: The scene with all objects that cast shadows during the capture.
         region: Sphere around the place that contains the surface and the occluders on it.
-        decisive: Minimum log likelihood over that of no sun.
+        decisive: Minimum log likelihood over that of no sun; the clock's prior counts if the shadows agree with it.
 
     Returns:
         The sun; None if no direction is decisively better than no sun.
     """
+    wider = _WIDER * region.radius
+    if captured.clock is None:
+        distance = float((captured.cameras.centers - region.center).norm(dim=1).median())
+        wider = max(region.radius, min(wider, distance))
+    radii = dict.fromkeys((region.radius, wider))
+    found = (_find_sun_within(captured, replace(region, radius=radius), decisive) for radius in radii)
+    return next((sun for sun in found if sun is not None), None)
+
+
+def _find_sun_within(captured: CapturedScene, region: BoundingSphere, decisive: float) -> Sun | None:
     shown = _ShadowEvidence.of(captured, region)
     if shown is None:
         return None
-    direction, evidence = shown.best(shown.above(_DIRECTIONS), _prior_by_clock(captured.clock))
-    if evidence < decisive:
+    direction, evidence, posterior = shown.best(shown.above(_DIRECTIONS), _prior_by_clock(captured.clock))
+    if evidence < _PROMISING or posterior < decisive:
         return None
     radius, ratio = _radius_and_ratio(shown, direction)
     if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
@@ -431,7 +447,7 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
         near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, *_BY_HAND_SPAN))
         if shown is None or not len(near):
             continue
-        found, evidence = shown.best(near, _prior_near(direction[None], _BY_HAND_DEG, wrong=0.0))
+        found, evidence, _ = shown.best(near, _prior_near(direction[None], _BY_HAND_DEG, wrong=0.0))
         radius, ratio = _radius_and_ratio(shown, found)
         if evidence > _PROMISING and ratio is not None and float(ratio @ LUMINANCE) > _MIN_RATIO:
             return Sun(found, radius, shown.surface.plane.normal, ratio, math.inf, name=SET_BY_HAND)
