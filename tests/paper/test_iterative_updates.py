@@ -7,6 +7,7 @@ import torch
 
 pytest.importorskip("diffusers")
 
+from killing import Killed
 from random_lpips import write_random_lpips
 from tiny_models import CHANNELS, flux_folder, quiet
 
@@ -76,6 +77,26 @@ def test_every_update_begins_at_the_noise_of_the_schedule_on_renders_of_the_scen
     assert torch.equal(descents[2][0], descents[1][1])
     assert torch.equal(descents[3][0], descents[2][1])
     assert torch.equal(read_gaussians(thrice / "scene.ply").sh, descents[3][1])
+    # the figure of 1, 2 and 3 updates
+    for number in range(3):
+        assert torch.equal(read_gaussians(thrice / "updates" / str(number) / "scene.ply").sh, descents[number + 1][1])
+    # killed at the second view of the last update, it continues with that view
+    made = len(asked)
+
+    def killed(self, view, strength):
+        if len(asked) == made + count + 1:
+            raise Killed
+        return watched(self, view, strength)
+
+    monkeypatch.setattr(FluxHarmonizer, "harmonize_from", killed)
+    again = replace(step, out=tmp_path / "again")
+    with pytest.raises(Killed):
+        perform(again, Console())
+    monkeypatch.setattr(FluxHarmonizer, "harmonize_from", watched)
+    perform(again, Console())
+    assert len(asked) == made + 2 * count
+    assert len(descents) == 1 + 3 + 3
+    assert torch.equal(read_gaussians(again.out / "scene.ply").sh, descents[3][1])
 
 
 def test_a_method_without_noise_begins_at_renders_too_and_says_so(finished_project, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """The command `paper consolidate`: the paper's consolidation, with iterative updates of the views."""
 
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from torch import Tensor
 from splatgraft.consolidation import ImageSequence, consolidate
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import stored_size
+from splatgraft.core.images import read_rgb, stored_size, write_image
 from splatgraft.fitting import l1_dssim
 from splatgraft.fitting.perceptual_losses import ImageLoss, lpips_vgg, windowed_fourier
 from splatgraft.folders.view_folder import ViewFolder
@@ -23,7 +24,6 @@ from splatgraft.harmonization import (
     HarmonizerContext,
     HarmonizerInputs,
     HarmonizerOptions,
-    harmonize,
     make_harmonizer,
 )
 from splatgraft.project.layout import SCENE_FILE
@@ -35,6 +35,8 @@ from splatgraft.runtime.progress import NoCheckpoint
 from splatgraft.runtime.settings import Table, from_table
 from splatgraft.steps import consolidate as tool
 from splatgraft_paper.consolidation import NoisyStartHarmonizer, PaperDescent, Schedule, descend_as_paper, noise_levels
+
+UPDATES_FOLDER = "updates"
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Consolidate(tool.Consolidate):
     lpips for paper and fourier for fast."""
     updates: int = 1
     """Number of harmonisations. After the first the views are harmonised again, by the method that made `images`, from
-    renders of the scene so far (paper, Iterative Dataset Update)."""
+    renders of the scene so far (paper, Iterative Dataset Update). updates/ has the scene and the views of each."""
     schedule: Schedule = "linear"
     """Noise of the updates, from 1 to 0.1 by equal differences or by equal ratios."""
     iterations: int = 10_000
@@ -77,12 +79,21 @@ class Consolidate(tool.Consolidate):
             services = {"progress": context.progress, "checkpoint": kept}
             return descend_as_paper(scene, cameras, images, settings, **services)
 
-        scene = fit(read_gaussians(self.scene).to(device), images, again=False)
-        if harmonizer is not None:
-            for strength in noise_levels(self.schedule, self.updates)[1:]:
+        begun = read_gaussians(self.scene).to(device)
+        if harmonizer is None:
+            scene = fit(begun, images, again=False)
+        else:
+            # a killed run continues with the next view of the update at which it was
+            kept = context.checkpoint.folder / UPDATES_FOLDER
+            scene = _kept_scene(kept / "0", device, lambda: fit(begun, images, again=False))
+            for number, strength in enumerate(noise_levels(self.schedule, self.updates)[1:], 1):
                 shown = _views_of(scene, views, cameras, descent.rendering)
-                made = harmonize(shown, _FromNoise(harmonizer, strength), progress=context.progress)
-                scene = fit(scene, [image.to(device) for image in made], again=True)
+                made = _kept_pictures(kept / str(number), views, shown, _FromNoise(harmonizer, strength), context)
+                read = LazySequence(len(made), lambda index, made=made: read_rgb(made[index]).to(device))
+                scene = _kept_scene(
+                    kept / str(number), device, lambda scene=scene, read=read: fit(scene, read, again=True)
+                )
+            shutil.copytree(kept, folder / UPDATES_FOLDER)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
 
     def image_loss(self) -> ImageLoss:
@@ -125,6 +136,28 @@ class _FromNoise:
         if isinstance(self.harmonizer, NoisyStartHarmonizer):
             return self.harmonizer.harmonize_from(view, self.strength)
         return self.harmonizer.harmonize(view)
+
+
+def _kept_scene(folder: Path, device: torch.device, make: Callable[[], Gaussians]) -> Gaussians:
+    """Read the scene of an update that an earlier run finished, or make and keep it."""
+    path = folder / SCENE_FILE
+    if not path.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_gaussians(path, make().to("cpu"))
+    return read_gaussians(path).to(device)
+
+
+def _kept_pictures(
+    folder: Path, views: ViewFolder, shown: Sequence[HarmonizerInputs], harmonizer: Harmonizer, context: Context
+) -> list[Path]:
+    """Harmonise the views of an update that an earlier run did not, and return the files of all."""
+    paths = [folder / "images" / f"{stem}.png" for stem in views.stems]
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    for index, path in enumerate(paths):
+        if not path.is_file():
+            write_image(path, harmonizer.harmonize(shown[index]).cpu())
+        context.progress(index + 1, len(paths), f"update {folder.name}, view {index + 1}")
+    return paths
 
 
 def _views_of(
