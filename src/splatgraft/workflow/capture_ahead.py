@@ -30,7 +30,7 @@ class CaptureAhead:
         self.name = name
         command = [sys.executable, "-m", __spec__.name, str(project), "" if out is None else str(out), name]
         self.process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, errors="replace"
         )
         self._lines: Queue[str] = Queue()
         self._reader = threading.Thread(target=self._read, daemon=True)

@@ -128,7 +128,7 @@ def _answer(job: Job, clock: Clock, name: str, level: str) -> Answer:
         with clock.phase("refinement"):
             better = [refined(job, work, models)] if models else []
         found = best_of(matched, [*models, *better], len(job.names))
-        found["moved"] = moved_photos(_database(job, _MASKED), found) if job.masks else []
+        found["moved"] = moved_photos(_database(job, _MASKED), found, Path(job.masks)) if job.masks else []
         _write(path, found | {"models": len(models), "method": method, "database": name})
     return json.loads(path.read_text())
 

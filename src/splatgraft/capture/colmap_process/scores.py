@@ -69,7 +69,7 @@ def explained_shares(matches: Matches, model: Any) -> dict[int, float]:
     return {i: float(explained / total) for i, (explained, total) in counts.items() if total}
 
 
-def moved_photos(database: Path, answer: Answer) -> list[str]:
+def moved_photos(database: Path, answer: Answer, masks: Path) -> list[str]:
     """Find photos whose poses contradict the matches on the object, because it was moved or turned between photos.
 
     Two photos agree on the object if their poses explain half of its matches. Photos that agree, directly or through
@@ -79,11 +79,12 @@ def moved_photos(database: Path, answer: Answer) -> list[str]:
     Args:
         database: Verified matches of the features inside the masks.
         answer: The model.
+        masks: Folder of the masks; photos without one contradict nothing.
 
     Returns:
         Names of the photos of all groups that contradict the largest one.
     """
-    posed = {image["name"]: image for image in answer["images"]}
+    posed = {i["name"]: i for i in answer["images"] if (masks / f"{i['name']}.png").is_file()}
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images() if image.name in posed}
         rays = {i: _rays(posed[name]["camera"], opened.read_keypoints(i)[:, :2]) for i, name in names.items()}
