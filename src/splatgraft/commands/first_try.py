@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from splatgraft.capture import read_doubts
 from splatgraft.commands.init import Init
 from splatgraft.folders.input_description import describe_input
 from splatgraft.project.layout import PROJECT_FILE, REPORT_FILE
@@ -139,7 +140,8 @@ def _rank(step: Step, note: Note) -> tuple[int, bool]:
     without a remedy comes after the step's measured faults.
     """
     if isinstance(step, Capture):
-        return (0 if note.text.startswith(f"{step.capture}: doubtful") else 4), not note.remedy
+        of_poses = any(str(doubt) in note.text for doubt in read_doubts(step.out))
+        return (0 if of_poses else 4), not note.remedy
     order = (Segment, Relight, Compose)
     return next((1 + i for i, kind in enumerate(order) if isinstance(step, kind)), 4), not note.remedy
 

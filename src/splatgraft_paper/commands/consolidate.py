@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -79,20 +80,17 @@ class Consolidate(tool.Consolidate):
             services = {"progress": context.progress, "checkpoint": kept}
             return descend_as_paper(scene, cameras, images, settings, **services)
 
-        begun = read_gaussians(self.scene).to(device)
-        if harmonizer is None:
-            scene = fit(begun, images, again=False)
-        else:
-            # a killed run continues with the next view of the update at which it was
-            kept = context.checkpoint.folder / UPDATES_FOLDER
-            scene = _kept_scene(kept / "0", device, lambda: fit(begun, images, again=False))
-            for number, strength in enumerate(noise_levels(self.schedule, self.updates)[1:], 1):
+        scene = read_gaussians(self.scene).to(device)
+        # a killed run continues with the next view of the update at which it was
+        kept = context.checkpoint.folder / UPDATES_FOLDER
+        for number, strength in enumerate(noise_levels(self.schedule, self.updates)):
+            update = kept / str(number)
+            if harmonizer is not None and number:
                 shown = _views_of(scene, views, cameras, descent.rendering)
-                made = _kept_pictures(kept / str(number), views, shown, _FromNoise(harmonizer, strength), context)
-                read = LazySequence(len(made), lambda index, made=made: read_rgb(made[index]).to(device))
-                scene = _kept_scene(
-                    kept / str(number), device, lambda scene=scene, read=read: fit(scene, read, again=True)
-                )
+                made = _kept_pictures(update, views, shown, _FromNoise(harmonizer, strength), context)
+                images = LazySequence(len(made), lambda index, made=made: read_rgb(made[index]).to(device))
+            scene = _kept_scene(update, device, partial(fit, scene, images, again=number > 0))
+        if self.updates > 1:
             shutil.copytree(kept, folder / UPDATES_FOLDER)
         write_gaussians(folder / SCENE_FILE, scene.to("cpu"))
 

@@ -49,13 +49,9 @@ def main(words: dict[str, Any]) -> None:
     pycolmap.set_random_seed(job.seed)
     with clock.phase("features"):
         find_features(job)
-    best = _without_moved(_search(job, clock))
+    best = _search(job, clock)
     times = {"seconds": clock.seconds, "cpu_seconds": clock.cpu_seconds}
     _write(job.output, best | {"unposed": unposed(_database(job, _ALL), best)} | times)
-
-
-def _without_moved(best: Answer) -> Answer:
-    return best | {"images": [image for image in best["images"] if image["name"] not in best["moved"]]}
 
 
 def _end_with_parent() -> None:
@@ -83,9 +79,9 @@ def _search(job: Job, clock: Clock) -> Answer:
             clock.pairs += match(job, database, level)
             if job.masks and name != _MASKED:
                 copy_with_features(database, _database(job, _MASKED), inside_masks(job, database))
-                match(job, _database(job, _MASKED), level)
+                clock.pairs += match(job, _database(job, _MASKED), level)
         answers.append(_answer(job, clock, name, level))
-        posed = _agreeing(answers[-1])
+        posed = len(answers[-1]["images"])
         # before the last level, photos without matches may still get some from more pairs
         return (
             answers[-1]["explained"] >= _CLEAR_EXPLAINED
@@ -102,7 +98,7 @@ def _search(job: Job, clock: Clock) -> Answer:
             return _best(answers)
     for level in further:
         best = _best(answers)
-        if _agreeing(best) >= _ENOUGH_PHOTOS * len(job.names):
+        if len(best["images"]) >= _ENOUGH_PHOTOS * len(job.names):
             break
         pairs, seconds = unmatched_pairs(job, _database(job, best["database"])), clock.seconds_per_pair
         time = f", about {max(1, round(pairs * seconds / 60))} min" if seconds else ""
@@ -117,7 +113,10 @@ def _database(job: Job, name: str) -> Path:
 
 
 def _answer(job: Job, clock: Clock, name: str, level: str) -> Answer:
-    """Make a model from the matches in a database, or read the one that a killed run left in the scratch folder."""
+    """Make a model from the matches in a database, or read the one that a killed run left in the scratch folder.
+
+    Photos that contradict the matches on the object are in the file, not in the result.
+    """
     method = f"global, {level} pairs{' inside the masks' if name == _MASKED else ''}"
     path = job.folder / "answers" / f"{method}.json"
     if not path.is_file():
@@ -130,7 +129,8 @@ def _answer(job: Job, clock: Clock, name: str, level: str) -> Answer:
         found = best_of(matched, [*models, *better], len(job.names))
         found["moved"] = moved_photos(_database(job, _MASKED), found, Path(job.masks)) if job.masks else []
         _write(path, found | {"models": len(models), "method": method, "database": name})
-    return json.loads(path.read_text())
+    answer = json.loads(path.read_text())
+    return answer | {"images": [image for image in answer["images"] if image["name"] not in answer["moved"]]}
 
 
 def _best(answers: list[Answer]) -> Answer:
@@ -142,19 +142,14 @@ def _best(answers: list[Answer]) -> Answer:
     best: dict[str, Answer] = {}
     for answer in sorted(answers, key=lambda answer: (answer["database"] == _MASKED, -answer["score"])):
         best.setdefault(answer["database"], answer)
-    return max(best.values(), key=lambda answer: _agreeing(answer) * min(answer["explained"], _CLEAR_EXPLAINED))
-
-
-def _agreeing(answer: Answer) -> int:
-    """Count the photos with a pose that does not contradict the matches on the object."""
-    return len(answer["images"]) - len(answer["moved"])
+    return max(best.values(), key=lambda answer: len(answer["images"]) * min(answer["explained"], _CLEAR_EXPLAINED))
 
 
 def _shortfall(answers: list[Answer], job: Job) -> str:
     """Describe the best model so far by photos and explained matches."""
     best = _best(answers)
     moved = f", {len(best['moved'])} more contradict the object's matches" if best["moved"] else ""
-    return f"{_agreeing(best)} of {len(job.names)} photos{moved}, {best['explained']:.0%} of matches explained"
+    return f"{len(best['images'])} of {len(job.names)} photos{moved}, {best['explained']:.0%} of matches explained"
 
 
 def _global_models(job: Job, database: Path) -> list[Any]:

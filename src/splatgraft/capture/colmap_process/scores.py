@@ -106,9 +106,9 @@ def moved_photos(database: Path, answer: Answer, masks: Path) -> list[str]:
             apart.append((a, b))
     sizes = Counter(root(i) for i in names)
     largest = max(sizes, key=lambda i: (sizes[i], -i), default=0)
-    against = {root(pair[0]) for pair in apart} | {root(pair[1]) for pair in apart}
-    against &= {root(b if root(a) == largest else a) for a, b in apart if largest in (root(a), root(b))}
-    return sorted(names[i] for i in names if root(i) in against - {largest})
+    pairs = [{root(a), root(b)} for a, b in apart]
+    against = {one for pair in pairs if largest in pair for one in pair} - {largest}
+    return sorted(names[i] for i in names if root(i) in against)
 
 
 def _rays(camera: list[float], keypoints: np.ndarray) -> np.ndarray:
