@@ -27,7 +27,7 @@ from splatgraft.project.record import read_record, why_stale
 from splatgraft.project.step import FolderCheckpoint, job_of, replacing
 from splatgraft.runtime.settings import choices, field_types
 from splatgraft.steps.harmonize import Harmonize
-from splatgraft.workflow import capture_ahead, run
+from splatgraft.workflow import run
 from splatgraft.workflow.flow import read_flow
 
 STEPS = ("segment", "compose", "relight", "render", "harmonize", "consolidate", "evaluate")
@@ -204,20 +204,20 @@ def test_views_of_a_ground_truth_that_no_step_saw_are_measured_apart(project: Pa
 def test_a_later_capture_is_made_by_a_second_process_and_its_failure_is_the_steps_own(
     project: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(capture_ahead, "_WORTHWHILE_SECONDS", -1.0)
+    monkeypatch.setattr(run, "_WORTHWHILE_SECONDS", -1.0)
     performed, processes = [], []
-    perform, finish = run.perform, capture_ahead.CaptureAhead.finish
+    perform, finish = run.perform, run._finish
 
     def performing(step: Any, console: Any, *, name: str) -> Path:
         performed.append(name)
         return perform(step, console, name=name)
 
-    def finishing(self: capture_ahead.CaptureAhead, console: Any) -> None:
-        processes.append(self.process)
-        finish(self, console)
+    def finishing(process: subprocess.Popen[str], console: Any) -> None:
+        processes.append(process)
+        finish(process, console)
 
     monkeypatch.setattr(run, "perform", performing)
-    monkeypatch.setattr(capture_ahead.CaptureAhead, "finish", finishing)
+    monkeypatch.setattr(run, "_finish", finishing)
     flow = read_flow(project)
     before = contents(flow.steps["target/capture"].out)
     for side in ("source", "target"):

@@ -1,17 +1,25 @@
 """Run a project and read its state, for the commands `run` and `status` and for Python."""
 
-from contextlib import nullcontext
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
+from splatgraft.editor.jobs import PlannedStep
 from splatgraft.project.layout import REPORT_FILE, SCENE_FILE
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import clear_leftovers, job_of, locked, perform
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import is_writable
 from splatgraft.steps.capture import Capture, doubt_about
-from splatgraft.workflow.capture_ahead import captures_ahead
-from splatgraft.workflow.flow import read_flow, reasons
+from splatgraft.workflow.flow import Flow, read_flow, reasons
 from splatgraft.workflow.time_estimate import describe_estimate, estimate_step_times
+
+_WORTHWHILE_SECONDS = 20.0  # expected time of a capture from which a process of its own is worth its start
+_PERFORM_ALONE = "import sys; from splatgraft.workflow.run import perform_alone; perform_alone(*sys.argv[1:])"
 
 
 def run_steps(
@@ -38,12 +46,12 @@ def run_steps(
         planned = estimate_step_times(flow, [name for name in wanted if name in forced or why[name] is not None])
         if planned:
             console.say(describe_estimate(planned))
-        with captures_ahead(flow, project, out, planned) as begun:
+        with _captures_ahead(flow, project, out, planned) as begun:
             for name, step in wanted.items():
                 reason = "asked for" if name in forced else why_stale(job_of(step))
                 console.say(f"{name:<20} {reason or 'up to date'}")
                 if name in begun:
-                    begun[name].finish(console)
+                    _finish(begun[name], console)
                     reason = why_stale(job_of(step))
                 if reason:
                     perform(step, console, name=name)
@@ -56,6 +64,63 @@ def run_steps(
     for name, path in (("consolidate", layout.result / SCENE_FILE), ("evaluate", layout.report / REPORT_FILE)):
         if name in wanted:
             console.result(path)
+
+
+@contextmanager
+def _captures_ahead(
+    flow: Flow, project: Path, out: Path | None, planned: Sequence[PlannedStep]
+) -> Generator[dict[str, subprocess.Popen[str]]]:
+    """Begin all planned captures but the first, each in a process; at the end, those still running are stopped.
+
+    Half of structure from motion runs on one core (mapping and refinement), so two captures at once take little longer
+    than one. Short captures are not begun. A later run continues a capture that was stopped.
+
+    Yields:
+        The processes by the name of their step.
+    """
+    long = [
+        one.name for one in planned if isinstance(flow.steps[one.name], Capture) and one.seconds > _WORTHWHILE_SECONDS
+    ]
+    begun: dict[str, subprocess.Popen[str]] = {}
+    try:
+        for name in long[1:]:
+            command = [sys.executable, "-c", _PERFORM_ALONE, str(project), "" if out is None else str(out), name]
+            pipe = subprocess.PIPE
+            begun[name] = subprocess.Popen(
+                command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe, errors="replace"
+            )
+        yield begun
+    finally:
+        for process in begun.values():
+            process.terminate()
+            process.communicate()
+
+
+def _finish(process: subprocess.Popen[str], console: Console) -> None:
+    """Print the messages of a process until it ends; a failure is left to the step's own error."""
+    assert process.stderr is not None
+    for line in process.stderr:
+        console.say(line.rstrip())
+    process.wait()
+
+
+def perform_alone(project: str, out: str, name: str) -> None:
+    """Perform one step of a project in this process, which ends when the process that began it ends.
+
+    Args:
+        project: The project file, or its folder.
+        out: Root of the results; empty for the project's folder.
+        name: The step.
+    """
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    perform(read_flow(Path(project), Path(out) if out else None).steps[name], Console(), name=name)
+
+
+def _end_with_parent() -> None:
+    # standard input closes with the parent; sys.stdin has a lock that a thread may hold at the exit
+    while os.read(0, 1):
+        pass
+    os._exit(1)
 
 
 def run_project(
