@@ -88,7 +88,7 @@ _ON_SURFACE = _TOLERANCES[-1]  # largest distance of a point from the level plan
 _LEVEL = 0.15  # distance from the plane within which ground is level, folds of a cloth included; higher things obstruct
 _MAX_ERROR = 0.12  # bound on the distance of a point in the comparison of a sloped plane with a level one
 _AROUND = 6.0  # radius of the disc whose slope counts if the smaller one's differs, as at the edge of a cloth
-_SAME_SLOPE = math.cos(math.radians(4.0))  # smallest cosine between two slopes that count as one
+_SAME_SLOPE = math.cos(math.radians(4.0))  # smallest cosine between two normals that count as the same slope
 _SLOPE_GAIN = 0.7  # largest error of the sloped plane over that of the level one; a slope that explains less is noise
 
 
@@ -145,7 +145,7 @@ def support_below(
         raise ValueError(f"placement: expected a surface below ({where}), found none; name another point")
     points = ground.points[solid] - point
     normal, height = _fit_level_plane(points, ground.heights[solid], up=up, radius=radius)
-    if not torch.equal(normal, up):
+    if float(normal @ up) < _SAME_SLOPE:
         wide = height_map(scene, point, up=up, radius=_AROUND * radius, top=top, size=_DISC_SIZE_PX)
         held = wide.alpha > 0.5
         around, _ = _fit_level_plane(wide.points[held] - point, wide.heights[held], up=up, radius=radius)
