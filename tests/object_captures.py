@@ -2,7 +2,8 @@
 
 Each `kind` is one way in which colour alone misleads: `plain` (it does not), `like_the_table` (the object has the
 colour of the wooden table), `two_parts` (a dark pot below green leaves, on a dark cloth), `crowded` (others stand
-beside it). `on_a_wall` hangs on one, beside a stain of its own colour and a shelf, and is photographed from the front.
+beside it), `footed` (it stands on a ring of the table's colour). `on_a_wall` hangs on one, beside a stain of its own
+colour and a shelf, and is photographed from the front.
 """
 
 import math
@@ -18,7 +19,7 @@ from splatgraft.core.spherical_harmonics import dc_from_rgb
 from splatgraft.rendering import render
 
 KINDS = ("plain", "like_the_table", "two_parts", "crowded")
-TABLE, WALL = 0.7, 1.0
+TABLE, WALL, FOOT = 0.7, 1.0, 0.04
 WOOD, GREEN, DARK, CLAY = (0.55, 0.38, 0.24), (0.25, 0.42, 0.16), (0.18, 0.16, 0.16), (0.75, 0.30, 0.18)
 
 
@@ -86,6 +87,11 @@ def _object(kind: str, generator: torch.Generator) -> Gaussians:
             for x, y, z in ((0.05, 0.0, 0.2), (-0.06, 0.03, 0.22), (0.0, -0.06, 0.27), (0.01, 0.05, 0.3))
         ]
         return concatenate([pot, *leaves])
+    if kind == "footed":
+        ring = cylinder((0, 0, TABLE), radius=0.1, height=FOOT, srgb=WOOD, generator=generator)
+        return concatenate(
+            [ring, cylinder((0, 0, TABLE + FOOT), radius=0.1, height=0.2, srgb=CLAY, generator=generator)]
+        )
     if kind == "on_a_wall":
         plate = sheet((0, WALL - 0.03, 1.2), (0.12, 0, 0), (0, 0, 0.15), srgb=WOOD, generator=generator)
         return concatenate([plate, ball((0, WALL - 0.13, 1.22), radius=0.1, srgb=CLAY, generator=generator)])

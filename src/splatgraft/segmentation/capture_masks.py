@@ -67,8 +67,7 @@ def cut_capture(
         pictures.append((small.image(index) * 255).round().to(torch.uint8))
     images = LazySequence(len(small), lambda index: pictures[index].float() / 255)
     views = CutViews(images, cameras, prompts)
-    allowed = region.allows(scene.means)
-    masks, _ = cut_object(views, scene, share=selection, allowed=allowed, cutter=request.cutter, progress=progress)
+    masks, _ = cut_object(views, scene, share=selection, region=region, cutter=request.cutter, progress=progress)
     sizes = capture.cameras.sizes.tolist()
     return ((resize(mask, *sizes[index]) > 0.5).float() for index, mask in enumerate(masks)), region
 

@@ -17,6 +17,7 @@ from splatgraft.core.prompts import ViewPrompt
 from splatgraft.rendering import RenderOptions, view_operator
 from splatgraft.runtime.progress import Progress, silent
 from splatgraft.segmentation.lift import share_inside, weight_inside
+from splatgraft.segmentation.object_region import ObjectRegion
 
 MIN_AGREEMENT = 0.7
 """Mean IoU below which the object is doubtful. An outline that is off by 2% of the object's diameter all around gives
@@ -78,21 +79,21 @@ def cut_object(
     *,
     share: Float[Tensor, "n"] | Bool[Tensor, "n"],
     cutter: ViewCutter,
-    allowed: Bool[Tensor, "n"] | None = None,
+    region: ObjectRegion | None = None,
     progress: Progress = silent,
 ) -> tuple[list[Float[Tensor, "_ _"]], Float[Tensor, "n"]]:
     """Cut the object out of every picture, in rounds, until the masks no longer change.
 
     Each round renders the 3D selection into every picture, cuts the picture, and lifts all masks together to a new
-    selection. The other pictures outvote a wrong mask. The limit `allowed` keeps masks from growing over a wall of the
-    object's colour.
+    selection. The other pictures outvote a wrong mask. The region keeps masks from growing over a wall of the object's
+    colour, and adds a foot of another colour between the selection and the support.
 
     Args:
         views: The pictures.
         scene: n Gaussians.
         share: First selection: share of each Gaussian in the object, in [0, 1].
         cutter: Algorithm for one picture.
-        allowed: True for Gaussians that may belong to the object; None allows all.
+        region: Region that bounds the object and has its support; None allows all Gaussians.
         progress: Called per picture.
 
     Returns:
@@ -104,20 +105,23 @@ def cut_object(
     count = len(views.images)
     voting = sorted({round(i) for i in torch.linspace(0, count - 1, min(count, _VOTING)).tolist()})
     feature = share.float().to(scene.device)
-    may_be = torch.ones_like(feature) if allowed is None else allowed.float().to(scene.device)
+    may_be = torch.ones_like(feature) if region is None else region.allows(scene.means).float()
     masks: dict[int, Tensor] = {}
 
     def cut_and_lift(chosen: Sequence[int], what: str) -> tuple[dict[int, Tensor], Tensor]:
-        """Cut the chosen pictures by `feature`, and lift their masks to a new feature."""
+        """Cut the chosen pictures by `feature` and the object's foot, and lift their masks to a new feature."""
         total, made = torch.zeros(scene.count, 2, device=scene.device), {}
+        foot = torch.zeros_like(feature) if region is None else region.foot(scene, feature).float()
+        wanted = torch.stack([torch.maximum(feature, foot), foot], 1)
         for done, index in enumerate(chosen):
             progress(done, len(chosen), f"cutting masks, {what}")
             operator = view_operator(scene, views.cameras[index], RenderOptions())
-            lifted = operator.blend(feature[:, None])[..., 0].cpu()
+            lifted, is_foot = operator.blend(wanted).cpu().unbind(-1)
             prompt = views.prompts.get(index, ViewPrompt())
             # without a visible selection or click, the mask is empty
             shows = int((lifted > 0.5).sum()) >= _MIN_PIXELS or len(prompt.inside)
-            made[index] = cutter(views.images[index], lifted, prompt) if shows else torch.zeros_like(lifted)
+            cut = cutter(views.images[index], lifted, prompt) if shows else torch.zeros_like(lifted)
+            made[index] = torch.where(is_foot > 0.5, 1.0, cut)
             total += weight_inside(operator, made[index].to(scene.device))
         return made, share_inside(total) * may_be
 

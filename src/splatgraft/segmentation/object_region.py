@@ -10,6 +10,7 @@
 All constants are set by hand.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -23,6 +24,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up, focus_point
+from splatgraft.core.directions import tangents
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.planes import LevelPlane, LevelPlaneOptions, dominant_level_plane
 from splatgraft.core.posed_images import PosedImages
@@ -48,6 +50,10 @@ _TRIM = 0.01  # share of points outside the box at either end of each axis
 _MARGIN = 0.2  # margin at each end, over the longest edge: parts without texture have no points
 _REACH = 0.1  # largest distance of the object's Gaussians from the group of points, over the box's longest edge
 _BEYOND = 1.2  # factor on the box's edges that contains all of the object
+_FOOT = 0.25  # largest height of a foot over the object's; also the part of the object that gives the foot's outline
+_FOOT_WIDTH = 1.15  # largest width of a foot over that outline's; a reconstruction's noise widens it
+_FOOT_TRIM = 0.05  # share of that end's points outside each side of the polygon: the support's, selected wrongly
+_FOOT_SIDES = 24  # sides of the polygon around that outline
 _LEVEL_NORMAL_Z = 0.99  # smallest z of the support's normal at which the box ends above the support
 _COLOR_STEP = 2.0  # colour difference that doubles a path's length, over the median of neighbours (texture, noise)
 _NEIGHBOURS = 10  # nearest Gaussians to which paths lead
@@ -82,6 +88,34 @@ class ObjectRegion:
         """Test which points the pictures may add to the object: not far below the support, nor far from the box."""
         inside = _above(points, self.support, _NEAR_SUPPORT)
         return inside & self.box.grown(_BEYOND).contains(points) if self.is_whole else inside
+
+    def foot(self, scene: Gaussians, share: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """Select what stands between an object and its support, such as a ring of another colour.
+
+        These are opaque Gaussians above the support, at most a quarter of the object's height, within the horizontal
+        outline of the object's lower quarter. A cut by colour may leave them out.
+
+        Args:
+            scene: n Gaussians.
+            share: Share of each Gaussian in the object, in [0, 1].
+        """
+        opaque = scene.opacities > SURFACE_OPACITY
+        chosen = opaque & (share > 0.5)
+        if self.support is None or not bool(chosen.any()):
+            return torch.zeros_like(opaque)
+        heights = self.support.height(scene.means)
+        low, high = heights[chosen].quantile(torch.tensor([_TRIM, 1 - _TRIM]).to(heights)).tolist()
+        if low > _FOOT * high:  # the object hangs, or stands on something else
+            return torch.zeros_like(opaque)
+        is_low = (heights > _ABOVE_SUPPORT * self.support.thickness) & (heights < low + _FOOT * (high - low))
+        end = scene.means[chosen & is_low]
+        turns = torch.arange(_FOOT_SIDES).to(heights) * 2 * math.pi / _FOOT_SIDES
+        tangent, bitangent = tangents(self.support.normal.to(scene.means))
+        sides = turns.cos()[:, None] * tangent + turns.sin()[:, None] * bitangent
+        middle = end.median(0).values
+        widths = ((end - middle) @ sides.T).quantile(1 - _FOOT_TRIM, dim=0)
+        within = ((scene.means - middle) @ sides.T < _FOOT_WIDTH * widths).all(1)
+        return opaque & within & is_low
 
 
 def seed_selection(
