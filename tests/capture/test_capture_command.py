@@ -66,6 +66,8 @@ def test_what_is_not_usable_is_named_counted_and_left_out(tmp_path: Path, captur
     head = next(line for line in said.splitlines() if "warning" in line)
     assert "uses 9 of 14 images" in head
     assert all(f"{i:04d}.png" in head for i in range(1, 6))
+    # the photos around the first one are left out
+    assert "none between 0000.png and 0006.png" in said
     for reason in ("found none in", "truncated", "found 1x1", "finite numbers", "a copy of it"):
         assert reason in said
 

@@ -7,7 +7,7 @@ import torch
 from shapes import UP, ring, surfels
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
-from splatgraft.core.capture_orientation import quarter_turns
+from splatgraft.core.capture_orientation import quarter_turns, widest_gap
 from splatgraft.core.directions import even_directions
 from splatgraft.rendering import render
 
@@ -54,3 +54,11 @@ def test_single_photos_are_turned_by_the_others_and_what_is_not_clear_stays() ->
     # a short arc may consist of photos that were taken upright along a wall
     lying = around(last_deg=40).turned(torch.ones(COUNT, dtype=torch.long))
     assert quarter_turns(lying.world_from_camera).tolist() == [0] * COUNT
+
+
+def test_the_widest_gap_is_named_by_the_photographs_beside_it() -> None:
+    cameras = around(last_deg=180.0)
+    gap, names = widest_gap(cameras, torch.zeros(3))
+    # 24 cameras on a half circle
+    assert gap == pytest.approx(180, abs=1)
+    assert names == (cameras.names[-1], cameras.names[0])

@@ -11,7 +11,7 @@ from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.image_metrics import psnr
 from splatgraft.rendering import render
-from splatgraft.segmentation import close_unseen_side, widest_gap
+from splatgraft.segmentation import close_unseen_side
 
 CENTER = torch.tensor([0.3, -0.2, 0.5])
 
@@ -104,14 +104,3 @@ def test_masks_that_have_nothing_in_common_close_nothing() -> None:
     closed = close_unseen_side(whole, cameras, nothing)
     assert closed.gaussians.count == whole.count
     assert closed.guessed_share == 0
-
-
-def test_the_widest_gap_is_named_by_the_photographs_beside_it() -> None:
-    cameras = ring(20, 200, count=7)
-    gap, names = widest_gap(cameras, CENTER)
-    assert gap == pytest.approx(180, abs=1)
-    azimuths = [
-        round(math.degrees(math.atan2(*(cameras[cameras.names.index(n)].centers[0] - CENTER)[[1, 0]].tolist())))
-        for n in names
-    ]
-    assert azimuths == [-160, 20]

@@ -21,6 +21,8 @@ from scipy.sparse.csgraph import connected_components
 
 from splatgraft.capture.structure_from_motion import MIN_POSED_SHARE
 from splatgraft.capture.usable_views import MIN_VIEWS, log_sharpness
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.capture_orientation import WIDE_GAP_DEG, focus_point, widest_gap
 from splatgraft.core.exposure import Exposure, describe_inconsistency
 from splatgraft.core.posed_images import LeftOut
 from splatgraft.runtime.progress import Progress, silent
@@ -241,6 +243,19 @@ def find_in_count(count: int) -> Finding:
     if count < _FEW:
         return Finding("count", "doubtful", f"{text}, fewer than {_FEW}", "take 40 to 120 from all sides")
     return Finding("count", "good", text)
+
+
+def find_in_coverage(cameras: Cameras) -> Finding:
+    """Measure the part of the circle around their common focus point that posed photos cover."""
+    try:
+        gap, (first, last) = widest_gap(cameras, focus_point(cameras))
+    except ValueError:  # no common focus point
+        return Finding("coverage", "good", "the photos look outwards: a place, without an object to cut out")
+    text = f"the photos cover {360 - gap:.0f} of 360 degrees around their subject"
+    if gap < WIDE_GAP_DEG:
+        return Finding("coverage", "good", text)
+    remedy = "photograph an object from there, too, or its back is guessed; a place needs no such photos"
+    return Finding("coverage", "good" if gap < 180 else "doubtful", f"{text}, none between {first} and {last}", remedy)
 
 
 def find_in_odd_photos(odd: Sequence[LeftOut], count: int) -> Finding:

@@ -13,6 +13,7 @@ from splatgraft.capture.photo_inspection import (
     SIDE_PX,
     Finding,
     find_in_count,
+    find_in_coverage,
     find_in_exposures,
     find_in_odd_photos,
     find_in_photos,
@@ -21,7 +22,6 @@ from splatgraft.capture.photo_inspection import (
 from splatgraft.capture.usable_views import find_odd_photos
 from splatgraft.capture.video import grey_frames
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.capture_orientation import focus_point
 from splatgraft.core.images import read_exif, read_grey, stored_size
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.folders.clock_sun import read_clock_sun
@@ -32,7 +32,6 @@ from splatgraft.formats.captures.masks import PhotoFiles, find_photos
 from splatgraft.formats.captures.photo_archive import is_archive, unpack_photos
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
-from splatgraft.segmentation import WIDE_GAP_DEG, widest_gap
 
 _FRAMES = 40  # frames examined in a video; the command `capture` takes 120
 _DRAFT_SECONDS = 45.0  # to a draft of any size on two idle cores
@@ -97,7 +96,7 @@ class Check:
         yield from _sun(self.capture, used, None if posed is None else posed.cameras[torch.tensor(kept)])
         if posed is not None:
             yield Finding("poses", "good", f"given for {len(posed)} images, with {len(posed.points)} points")
-            yield _coverage(posed.cameras)
+            yield find_in_coverage(posed.cameras)
         else:
             yield Finding("poses", "good", "none: structure from motion finds them")
         yield _masks(sum(path is not None for path in photos.masks))
@@ -139,19 +138,6 @@ def _sun(capture: Path, photos: Sequence[Path], cameras: Cameras | None) -> Iter
     notes = [note.text for note in geotag_notes(tags, [photo.name for photo in photos])]
     for text in [said, *notes] if said else notes:
         yield Finding("sun", "good", text)
-
-
-def _coverage(cameras: Cameras) -> Finding:
-    """Measure how much of the circle around their common focus point the photos cover."""
-    try:
-        gap, (first, last) = widest_gap(cameras, focus_point(cameras))
-    except ValueError:  # no common focus point
-        return Finding("coverage", "good", "the photos look outwards: a place, without an object to cut out")
-    text = f"the photos cover {360 - gap:.0f} of 360 degrees around their subject"
-    if gap < WIDE_GAP_DEG:
-        return Finding("coverage", "good", text)
-    remedy = "photograph an object from there, too, or its back is guessed; a place needs no such photos"
-    return Finding("coverage", "good" if gap < 180 else "doubtful", f"{text}, none between {first} and {last}", remedy)
 
 
 def _masks(count: int) -> Finding:

@@ -7,7 +7,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
+from splatgraft.core.directions import tangents
 
+WIDE_GAP_DEG = 60.0
+"""Horizontal angle without photographs above which a gap is reported; set by hand."""
 _ROUNDS = 10  # iterations of reweighting; this and the others are set by hand
 _ROLL_RAD = 0.05  # roll above which a camera counts less: hand-held cameras are level to about three degrees
 _MEAN_UP_WEIGHT = 0.01  # weight of the images' mean up, equal to that of horizontal axes that spread over 6 degrees
@@ -109,3 +112,25 @@ def nearest_to_axes(cameras: Cameras, *, prior_weight: float) -> Float[Tensor, "
         miss = torch.einsum("vij,vj->vi", across, point - centers).norm(dim=-1)
         weight = 1 / (miss + _RESIDUAL_FLOOR * miss.median() + 1e-9)
     return point
+
+
+def widest_gap(cameras: Cameras, middle: Float[Tensor, "3"]) -> tuple[float, tuple[str, str]]:
+    """Find the widest horizontal angle around a point in which no photograph was taken.
+
+    Args:
+        cameras: Cameras of the photographs.
+        middle: The point, world units.
+
+    Returns:
+        The angle, degrees, and the names of the photographs on either side of it.
+    """
+    tangent, bitangent = tangents(estimate_up(cameras))
+    away = cameras.centers - middle
+    turns = torch.atan2(away @ bitangent, away @ tangent)
+    order = turns.argsort()
+    gaps = torch.remainder(turns[order].roll(-1) - turns[order], 2 * math.pi)
+    if len(cameras) == 1:
+        gaps += 2 * math.pi
+    first = int(gaps.argmax())
+    ends = order[first], order[(first + 1) % len(order)]
+    return math.degrees(float(gaps[first])), (cameras.names[int(ends[0])], cameras.names[int(ends[1])])

@@ -24,12 +24,11 @@ from splatgraft.segmentation.selection import (
     select_object,
 )
 from splatgraft.segmentation.solidify import SolidifyOptions, solidify_object
-from splatgraft.segmentation.unseen_side import WIDE_GAP_DEG, ClosedObject, close_unseen_side, widest_gap
+from splatgraft.segmentation.unseen_side import ClosedObject, close_unseen_side
 
 __all__ = [
     "CUT_SIDE_PX",
     "MIN_AGREEMENT",
-    "WIDE_GAP_DEG",
     "Agreement",
     "Box",
     "ClosedObject",
@@ -59,5 +58,4 @@ __all__ = [
     "segment",
     "select_object",
     "solidify_object",
-    "widest_gap",
 ]

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.core.directions import frames_along, tangents
+from splatgraft.core.directions import frames_along
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.rotations import quaternion_from_rotation, rotation_from_quaternion
 from splatgraft.rendering import RenderOptions, view_operator
@@ -45,8 +45,6 @@ _UNDERSIDE = -0.3  # largest upward component of a normal of the underside, whic
 _NEIGHBOURS = 8
 _ROUNDS = 400  # iterations of Jacobi's method; each carries colours one neighbour farther
 _LEAST = 0.02  # unseen share of the surface below which an object counts as seen from all sides
-WIDE_GAP_DEG = 60.0
-"""Horizontal angle without photographs above which a gap is reported."""
 
 
 @dataclass(frozen=True)
@@ -121,28 +119,6 @@ def close_unseen_side(object_: Gaussians, cameras: Cameras, masks: Sequence[Floa
     closing = closing.select(~_shows(closing, object_, cameras))
     is_guessed = torch.cat([nothing.is_guessed, torch.ones(closing.count, dtype=torch.bool)])
     return ClosedObject(concatenate([object_, closing]), is_guessed, share)
-
-
-def widest_gap(cameras: Cameras, middle: Float[Tensor, "3"]) -> tuple[float, tuple[str, str]]:
-    """Find the widest horizontal angle around a point in which no photograph was taken.
-
-    Args:
-        cameras: Cameras of the photographs.
-        middle: The point, world units.
-
-    Returns:
-        The angle, degrees, and the names of the photographs on either side of it.
-    """
-    tangent, bitangent = tangents(estimate_up(cameras))
-    away = cameras.centers - middle
-    turns = torch.atan2(away @ bitangent, away @ tangent)
-    order = turns.argsort()
-    gaps = torch.remainder(turns[order].roll(-1) - turns[order], 2 * math.pi)
-    if len(cameras) == 1:
-        gaps += 2 * math.pi
-    first = int(gaps.argmax())
-    ends = order[first], order[(first + 1) % len(order)]
-    return math.degrees(float(gaps[first])), (cameras.names[int(ends[0])], cameras.names[int(ends[1])])
 
 
 def _carved(

@@ -21,6 +21,7 @@ from splatgraft.capture import (
     write_pose_report,
     write_reduced,
 )
+from splatgraft.capture.photo_inspection import find_in_coverage
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.images import write_image
 from splatgraft.core.posed_images import PosedImages
@@ -122,6 +123,8 @@ class Capture:
             originals = tuple(by_stem[Path(name).stem] for name in posed.cameras.names)
         require_coverage(posed, str(self.capture))
         write_capture(folder, posed.limited(self.max_side) if self.max_side > 0 else posed)
+        if originals:
+            context.console.say(f"{self.capture}: {find_in_coverage(posed.cameras)}")
         if self.clock_sun and originals:
             self._write_clock_sun(folder, originals, posed.cameras, context)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatgraft.composition import Coverage
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.core.capture_orientation import WIDE_GAP_DEG, estimate_up, widest_gap
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import resize, write_image
 from splatgraft.core.posed_images import PosedImages
@@ -38,7 +38,6 @@ from splatgraft.runtime.note import Note
 from splatgraft.segmentation import (
     CUT_SIDE_PX,
     MIN_AGREEMENT,
-    WIDE_GAP_DEG,
     Agreement,
     Box,
     CutRequest,
@@ -58,7 +57,6 @@ from splatgraft.segmentation import (
     part_shares,
     select_object,
     solidify_object,
-    widest_gap,
 )
 
 SHEET_FILE = "views.png"
