@@ -3,7 +3,7 @@
 1. The masks carve the visual hull out of a grid of voxels (Laurentini 1994); silhouettes from one side also give the
    outline from the other.
 2. Flat opaque Gaussians are placed on the parts of the hull that no camera sees, unless the object has a surface there.
-3. Their colours continue those at the border of the seen surface (Laplace's equation on the surface).
+3. Their colours continue hue and saturation at the border of the seen surface (Laplace's equation on the surface).
 4. Gaussians that would show in a photograph are removed.
 """
 
@@ -44,6 +44,7 @@ _LOGIT = 4.0  # opacity .98
 _UNDERSIDE = -0.3  # largest upward component of a normal of the underside, which photographs cannot show
 _NEIGHBOURS = 8
 _ROUNDS = 400  # iterations of Jacobi's method; each carries colours one neighbour farther
+_MAX_SATURATION = 4.0  # largest factor on a continued colour's saturation; opposite hues leave none to increase
 _LEAST = 0.02  # unseen share of the surface below which an object counts as seen from all sides
 
 
@@ -245,12 +246,22 @@ def _shows(closing: Gaussians, object_: Gaussians, cameras: Cameras) -> Bool[Ten
 
 
 def _continued(hull: _Hull, seen: Bool[Tensor, "m"], object_: Gaussians) -> Float[Tensor, "m 3"]:
-    """Compute band 0 at the points of a hull: the object's where it was seen, and a smooth continuation elsewhere."""
+    """Compute band 0 at the points of a hull: the object's where it was seen, and a smooth continuation elsewhere.
+
+    The saturation is continued beside the colour, because a mean of several hues would be grey.
+    """
     _, nearest = KDTree(object_.means.numpy()).query(hull.points.numpy(), k=min(_NEIGHBOURS, object_.count))
-    known = object_.sh[:, 0][torch.from_numpy(nearest).reshape(len(hull.points), -1)].mean(1)
+    colors = object_.sh[:, 0][torch.from_numpy(nearest).reshape(len(hull.points), -1)].mean(1)
+    known = torch.cat([colors, _chroma(colors).norm(dim=1, keepdim=True)], 1)
     _, around = KDTree(hull.points.numpy()).query(hull.points.numpy(), k=min(_NEIGHBOURS, len(hull.points)))
     around = torch.from_numpy(around).reshape(len(hull.points), -1)
-    colors = torch.where(seen[:, None], known, known[seen].mean(0))
+    smooth = torch.where(seen[:, None], known, known[seen].mean(0))
     for _ in range(_ROUNDS):
-        colors = torch.where(seen[:, None], known, colors[around].mean(1))
-    return colors
+        smooth = torch.where(seen[:, None], known, smooth[around].mean(1))
+    chroma, saturation = _chroma(smooth[:, :3]), smooth[:, 3:]
+    factor = saturation / torch.maximum(chroma.norm(dim=1, keepdim=True), saturation / _MAX_SATURATION).clamp_min(1e-6)
+    return torch.where(seen[:, None], colors, smooth[:, :3] + (factor - 1) * chroma)
+
+
+def _chroma(colors: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
+    return colors - colors.mean(1, keepdim=True)
