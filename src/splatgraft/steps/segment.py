@@ -63,6 +63,7 @@ SHEET_FILE = "views.png"
 AGREEMENT_FILE = "agreement.json"
 SOLID_SIDE_PX = 960
 """Longest side of the photos that the object is fitted to; time and memory grow with their area."""
+_LIFTED_SIDE_PX = 640  # longest side of the masks that are lifted; full masks change one Gaussian in a thousand
 _PICTURED = 8  # photographs on the sheet
 _SEPARATE = 0.1  # share of the object's opacity; warn if a separate part has more
 _MUCH_GUESSED = 0.1  # share of the surface; warn if more was never photographed
@@ -143,8 +144,8 @@ class Segment:
             feature = box.contains(scene.means).float()
         else:
             masked = self._masked_views(capture, on_device, folder, box, context)
-            cameras = masked.views.cameras.to(device)
-            feature = lift_masks(on_device, cameras, masked.masks, self.options, progress=context.progress)
+            cameras, small = _small_masks(masked, _LIFTED_SIDE_PX)
+            feature = lift_masks(on_device, cameras.to(device), small, self.options, progress=context.progress)
             if masked.region is not None:
                 feature = feature * masked.region.allows(on_device.means)
             feature = feature.cpu()
@@ -215,7 +216,7 @@ class Segment:
         self, object_: Gaussians, masked: MaskedViews, folder: Path, context: Context
     ) -> tuple[Gaussians, Bool[Tensor, "k"]]:
         """Close the object's unseen side; also return which Gaussians close it."""
-        views, small = _small_masks(masked)
+        views, small = _small_masks(masked, CUT_SIDE_PX)
         closed = close_unseen_side(object_, views, small)
         share = closed.guessed_share
         text = f"{share:.0%} of the object's surface was never photographed: its shape and colour there are a guess."
@@ -237,7 +238,7 @@ class Segment:
         self, masked: MaskedViews, scene: Gaussians, selection: Bool[Tensor, "n"], folder: Path, context: Context
     ) -> None:
         """Measure how well the masks agree, and write the measure with a picture."""
-        cameras, small = _small_masks(masked)
+        cameras, small = _small_masks(masked, CUT_SIDE_PX)
         agreement = measure_agreement(small, scene, cameras.to(scene.device), selection, progress=context.progress)
         with atomic_write(folder / AGREEMENT_FILE) as stream:
             stream.write((json.dumps(agreement.as_json(), indent=1) + "\n").encode())
@@ -249,9 +250,9 @@ class Segment:
         context.console.tell(*_part_notes(part_shares(scene.select(selection)), folder / SHEET_FILE))
 
 
-def _small_masks(masked: MaskedViews) -> tuple[Cameras, Sequence[Tensor]]:
-    """Return the views at the size at which masks are cut, and their masks, read on access."""
-    cameras = masked.views.cameras.resized(min(1.0, CUT_SIDE_PX / int(masked.views.cameras.sizes.max())))
+def _small_masks(masked: MaskedViews, side_px: int) -> tuple[Cameras, Sequence[Tensor]]:
+    """Return the views with a longest side of at most `side_px`, and their masks, read on access."""
+    cameras = masked.views.cameras.resized(min(1.0, side_px / int(masked.views.cameras.sizes.max())))
     sizes = cameras.sizes.tolist()
     return cameras, LazySequence(len(sizes), lambda index: resize(masked.masks[index], *sizes[index]))
 
