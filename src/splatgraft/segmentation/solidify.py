@@ -7,7 +7,8 @@ and Gaussians of this fit belong to the object, so a draft of the capture is eno
 1. Each view is cropped to the object. Pixels in which something else hides the object are not compared.
 2. The object is fitted. If it has few Gaussians for its size in the photographs, Gaussians are split as in a
    reconstruction.
-3. Gaussians that hardly show in any view take the mean colour of their neighbours.
+3. Gaussians outside more than a third of the masks are removed.
+4. Gaussians that hardly show in any view take the mean colour of their neighbours.
 
 All constants are set by hand.
 """
@@ -32,6 +33,7 @@ _DENSIFICATIONS = 20  # number of densifications
 _FULL_AT, _STOP_AT = 0.6, 0.7  # shares of the steps at which the number is reached, and after which density is fixed
 _STRIDE = 2  # distance of the fitted pixels along each axis
 _HIDDEN = 0.1  # visible pixels over a Gaussian's own area, relative to the median, below which its colour is unknown
+_IN_MASKS = 0.75  # smallest share of the masks that contain a Gaussian: that of the selection
 _NEIGHBOURS = 8  # Gaussians of known colour whose mean replaces an unknown one
 _RATES = LearningRates(
     means=1.6e-3,
@@ -107,10 +109,11 @@ def solidify_object(
         ValueError: No mask shows the object.
     """
     chosen = scene.select(selection)
-    views, gains = [], []
+    views, gains, used = [], [], []
     for index, (camera, (image, mask)) in enumerate(zip(cameras, photographs, strict=True)):
         if (view := _cropped_view(scene, selection, camera, image, mask)) is not None:
             views.append(view)
+            used.append(index)
             gains.append(1.0 if options.view_gains is None else options.view_gains[index])
     if not views:
         raise ValueError("object: expected a mask with some of it inside, found all empty")
@@ -136,7 +139,34 @@ def solidify_object(
         control=None if options.pixels_per_gaussian == 0 else _density(chosen, views, cameras, options).update,
         progress=lambda done, total, text: progress(done, total, f"making the object solid, {text}"),
     )
-    return _with_known_colors(fitted, views)
+    return _with_known_colors(fitted.select(_in_most_masks(fitted, cameras[torch.tensor(used)], views)), views)
+
+
+def _in_most_masks(gaussians: Gaussians, cameras: Cameras, views: Sequence[View]) -> Bool[Tensor, "n"]:
+    """Test which centres lie inside most masks of the photographs that frame them and in which nothing hides them.
+
+    A few wrong masks that contain the same part of the background would leave it on the object as a strand.
+
+    Args:
+        gaussians: n Gaussians.
+        cameras: Cameras of the whole photographs.
+        views: The same photographs, cropped; their masks are empty outside.
+    """
+    inside, outside = torch.zeros(2, gaussians.count, device=gaussians.device)
+    for camera, view in zip(cameras, views, strict=True):
+        assert view.mask is not None
+        pixels, depth = camera.project(gaussians.means)
+        is_framed = (depth > 0) & (pixels >= 0).all(1) & (pixels < camera.sizes[0]).all(1)
+        corner = camera.intrinsics[0, :2, 2] - view.camera.intrinsics[0, :2, 2]
+        column, row = (pixels - corner).nan_to_num(-1).clamp(-1, 1e6).floor().long().unbind(1)
+        height, width = view.mask.shape[:2]
+        is_cropped = (column < 0) | (column >= width) | (row < 0) | (row >= height)
+        at = row.clamp(0, height - 1), column.clamp(0, width - 1)
+        is_inside = ~is_cropped & (view.mask[..., 0][at] > 127)
+        is_hidden = torch.zeros_like(is_framed) if view.is_compared is None else ~view.is_compared[..., 0][at]
+        inside += is_framed & is_inside
+        outside += is_framed & ~is_inside & (is_cropped | ~is_hidden)
+    return inside >= _IN_MASKS * (inside + outside)
 
 
 def _density(chosen: Gaussians, views: Sequence[View], cameras: Cameras, options: SolidifyOptions) -> DensityControl:
