@@ -43,7 +43,8 @@ def test_solid_inside_and_gone_outside(glassy, cameras, photographs, masks):
 
 def test_a_strand_that_two_of_six_masks_contain_is_removed(scene, cameras, photographs, masks):
     heights = torch.linspace(0.6, 1.2, 20)
-    pole = splats(torch.stack([0.2 * heights, torch.full((20,), 0.5), heights], 1), 0.06, 0.95, torch.full((20, 3), 0.4))
+    places = torch.stack([0.2 * heights, torch.full((20,), 0.5), heights], 1)
+    pole = splats(places, 0.06, 0.95, torch.full((20, 3), 0.4))
     whole = concatenate([scene.select(torch.arange(scene.count) < BALL), pole, scene])
     selection = torch.arange(whole.count) < BALL + 20
     wrong = [(alpha > 0.5).float() for alpha in render(whole.select(selection), cameras).alpha]
