@@ -658,7 +658,7 @@ def read_results(path: Path) -> Results:
     """Read the results that are there."""
     if not path.is_file():
         return {}
-    found = json.loads(path.read_text())
+    found = json.loads(path.read_text(encoding="utf-8"))
     return {scene: {row: Measured(**values) for row, values in rows.items()} for scene, rows in found.items()}
 
 
@@ -667,7 +667,7 @@ def write_results(path: Path, results: Results) -> None:
     record = {scene: {row: asdict(found) for row, found in rows.items()} for scene, rows in results.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
-    part.write_text(json.dumps(record, indent=1))
+    part.write_text(json.dumps(record, indent=1), encoding="utf-8")
     part.replace(path)
 
 

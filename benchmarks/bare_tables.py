@@ -146,7 +146,9 @@ def render_bare(out: Path, blender_python: Path) -> None:
         rendered, folder = out / "renders" / name, out / name
         rendered.mkdir(parents=True, exist_ok=True)
         # the worker takes an exposure that it finds; its own would make a black top grey and clip a spot of light
-        (rendered / "exposure.json").write_text(json.dumps({job.takes[0].exposure_group: table.exposure}))
+        (rendered / "exposure.json").write_text(
+            json.dumps({job.takes[0].exposure_group: table.exposure}), encoding="utf-8"
+        )
         render_job(job, rendered, blender_python)
         gather_capture(rendered, "target", folder, passes=("images", "depth"), points=False)
         points, colors = _points_with_texture(rendered / "target", rendered_cameras(rendered, _stems()))

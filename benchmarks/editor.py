@@ -61,10 +61,12 @@ def write_project(root: Path, count: int) -> Path:
     words = ["--source", str(root / "source.ply"), "--target", str(root / "target.ply")]
     with contextlib.redirect_stdout(sys.stderr):
         assert command(["init", str(project.parent), *words]) == 0
-        text = with_keys(project.read_text(), "segment", {"keep": "all", "mask_source": "box", "box": BALL_BOX})
+        text = with_keys(
+            project.read_text(encoding="utf-8"), "segment", {"keep": "all", "mask_source": "box", "box": BALL_BOX}
+        )
         for side in ("source", "target"):
             text = with_keys(text, side, {"views": 8, "picture_width": 320, "up": [0.0, 0.0, 1.0]})
-        project.write_text(with_keys(text, "compose", {"point": [0.0, 0.0, 0.5], "scale": 1.0}))
+        project.write_text(with_keys(text, "compose", {"point": [0.0, 0.0, 0.5], "scale": 1.0}), encoding="utf-8")
         assert command(["run", str(project), "--to", "compose"]) == 0
     return project
 

@@ -186,7 +186,7 @@ def main() -> None:
     everything = range(len(pairs))
     numbers = {name: value for name, value in asdict(RadianceSettings()).items() if name in (*FACTORS, *SHIFTS)}
     if options.start is not None:
-        numbers |= json.loads(options.start.read_text())
+        numbers |= json.loads(options.start.read_text(encoding="utf-8"))
     for fold in range(options.folds):
         inside = [i for i in everything if i % options.folds != fold]
         outside = [i for i in everything if i % options.folds == fold]
@@ -201,7 +201,7 @@ def main() -> None:
     print(f"objective {objective(rows):.3f}, means {[round(v, 3) for v in rows.mean(0).tolist()]}")
     print(json.dumps(found))
     if options.out is not None:
-        options.out.write_text(json.dumps(found, indent=1) + "\n")
+        options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

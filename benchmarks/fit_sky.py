@@ -32,7 +32,7 @@ def main() -> None:
         for path in sorted(folder.glob(f"*/{TRUE_LIGHT_FILE}")):
             if not set(OUTDOORS) & set(path.parent.name.split("_")):
                 continue
-            light = light_from_json(path.read_text(), name=str(path))
+            light = light_from_json(path.read_text(encoding="utf-8"), name=str(path))
             sun = max(light.sources, key=lambda one: one.luminance)
             sine = sun.direction[2]
             direct = torch.tensor(sun.irradiance) * max(sine, 0.0)

@@ -127,7 +127,7 @@ def plot(points: Sequence[tuple[float | None, float]], path: Path) -> None:
             marks.append(f'<path d="M{x - 4:.1f} {y - 4:.1f}l8 8m0 -8l-8 8" stroke="#888" stroke-width="1.5"/>')
         else:
             marks.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="#2673b8" fill-opacity="0.7"/>')
-    path.write_text("\n".join([*marks, "</svg>"]) + "\n")
+    path.write_text("\n".join([*marks, "</svg>"]) + "\n", encoding="utf-8")
 
 
 def places_of(scene: ExamScene) -> Iterator[tuple[str, Gaussians, Cameras, BoundingSphere, Light]]:

@@ -279,7 +279,7 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_image(folder / f"{case.name}.png", torch.cat(pictures))
         # saved after each scene: a stopped run keeps its rows
-        options.out.write_text(json.dumps({**head, "rows": [asdict(row) for row in rows]}, indent=1))
+        options.out.write_text(json.dumps({**head, "rows": [asdict(row) for row in rows]}, indent=1), encoding="utf-8")
     if rows:
         blocks = [table(rows, quality) for quality in options.qualities]
         print("\n" + "\n".join(blocks) + f"\n`{head['command']}` at commit {head['commit']}")

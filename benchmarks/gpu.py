@@ -361,19 +361,21 @@ def run_part(name: str, setting: Setting, out: Path) -> None:
     begin = time.perf_counter()
     rows = PARTS[name](setting)
     record = {"part": name, "toy": setting.toy, "seconds": round(time.perf_counter() - begin, 1), "rows": rows}
-    (out / f"{name}.json").write_text(json.dumps(record, indent=1))
+    (out / f"{name}.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
 
 
 def is_finished(path: Path, *, toy: bool) -> bool:
     """Return whether a part's file holds a result of the same size."""
-    return path.is_file() and json.loads(path.read_text()).get("toy") == toy
+    return path.is_file() and json.loads(path.read_text(encoding="utf-8")).get("toy") == toy
 
 
 def write_report(out: Path, names: list[str], failures: Mapping[str, str], card: str) -> None:
     """Write gpu.json and gpu.md from the parts that are finished."""
-    found = [json.loads(path.read_text()) for name in names if (path := out / f"{name}.json").is_file()]
+    found = [json.loads(path.read_text(encoding="utf-8")) for name in names if (path := out / f"{name}.json").is_file()]
     head = {"card": card, "torch": torch.__version__, "python": platform.python_version()}
-    (out / "gpu.json").write_text(json.dumps({**head, "parts": found, "failures": dict(failures)}, indent=1))
+    (out / "gpu.json").write_text(
+        json.dumps({**head, "parts": found, "failures": dict(failures)}, indent=1), encoding="utf-8"
+    )
     text = [f"# {card}", f"torch {torch.__version__}, Python {platform.python_version()}"]
     for record in found:
         columns = list(dict.fromkeys(key for row in record["rows"] for key in row))
@@ -381,7 +383,7 @@ def write_report(out: Path, names: list[str], failures: Mapping[str, str], card:
         lines += ["| " + " | ".join(_cell(row.get(column)) for column in columns) + " |" for row in record["rows"]]
         text += [f"## {record['part']} ({record['seconds']} s)", "\n".join(lines)]
     text += [f"- {name} failed: {reason}" for name, reason in failures.items()]
-    (out / "gpu.md").write_text("\n\n".join(text) + "\n")
+    (out / "gpu.md").write_text("\n\n".join(text) + "\n", encoding="utf-8")
 
 
 def _cell(value: object) -> str:
@@ -415,7 +417,7 @@ def main() -> int:
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=args.limit, check=False)
             if done.returncode:
-                (args.out / f"{name}.log").write_text(done.stdout + done.stderr)
+                (args.out / f"{name}.log").write_text(done.stdout + done.stderr, encoding="utf-8")
                 lines = done.stderr.strip().splitlines()
                 failures[name] = lines[-1] if lines else f"exit {done.returncode}"
         except subprocess.TimeoutExpired as stopped:

@@ -22,13 +22,13 @@ solidify = 40
 
 def main() -> None:
     project = Path(tempfile.mkdtemp(prefix="splatgraft_")) / "project.toml"
-    project.write_text(PROJECT)
+    project.write_text(PROJECT, encoding="utf-8")
     folders = sg.run_project(project, to="segment")
     print(f"the object: {sg.load(folders['segment'] / 'object.ply').count} Gaussians in {folders['segment']}")
     print("still to do:", sg.stale_steps(project))
 
     # a changed option makes the steps that depend on it stale; the next run repeats them
-    project.write_text(PROJECT.replace("solidify = 40", "solidify = 0"))
+    project.write_text(PROJECT.replace("solidify = 40", "solidify = 0"), encoding="utf-8")
     print("stale now:", sg.stale_steps(project)["segment"])
 
 

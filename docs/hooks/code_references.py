@@ -27,7 +27,7 @@ def on_pre_build(config: MkDocsConfig) -> None:
 
 def _problems(page: Path) -> list[str]:
     problems = []
-    for path, names in _REFERENCE.findall(page.read_text()):
+    for path, names in _REFERENCE.findall(page.read_text(encoding="utf-8")):
         first = path.split("/")[0]
         if first not in _OWN and not (_ROOTS[0] / first).is_dir():
             continue  # a folder of the user
@@ -35,7 +35,7 @@ def _problems(page: Path) -> list[str]:
         if found is None:
             problems.append(f"no {path}")
         elif names:
-            defined = _names(ast.parse(found.read_text()).body)
+            defined = _names(ast.parse(found.read_text(encoding="utf-8")).body)
             problems += [f"no {name} in {path}" for name in names.split(", ") if name not in defined]
     return problems
 

@@ -35,7 +35,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def _root_page(path: Path) -> str:
-    text = path.read_text().replace("](docs/", "](")
+    text = path.read_text(encoding="utf-8").replace("](docs/", "](")
     for name, target in ROOT_PAGES.items():
         text = text.replace(f"]({target})", f"]({name})")
     return text

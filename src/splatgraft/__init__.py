@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from splatgraft.core.gaussians import Gaussians
     from splatgraft.core.images import read_rgb as load_image
     from splatgraft.core.images import write_image as save_image
+    from splatgraft.core.images import write_radiance as save_hdr
     from splatgraft.core.posed_images import PosedImages, held_out
     from splatgraft.core.similarity import Similarity
     from splatgraft.evaluation import Truth, evaluate, true_views
@@ -43,12 +44,14 @@ if TYPE_CHECKING:
     )
     from splatgraft.reconstruction import ReconstructOptions, reconstruct
     from splatgraft.relighting import (
+        EnvironmentLight,
         LayerWeights,
         Light,
         LightSource,
         RelightOptions,
         Relit,
         SourceScene,
+        light_at,
         light_from_json,
         light_to_json,
         relight,
@@ -74,6 +77,7 @@ __all__ = [
     "Cameras",
     "Composite",
     "ConsolidateOptions",
+    "EnvironmentLight",
     "FluxOptions",
     "Gaussians",
     "Harmonizer",
@@ -105,6 +109,7 @@ __all__ = [
     "harmonize",
     "held_out",
     "lift_masks",
+    "light_at",
     "light_from_json",
     "light_to_json",
     "load",
@@ -121,6 +126,7 @@ __all__ = [
     "render_views",
     "run_project",
     "save",
+    "save_hdr",
     "save_image",
     "segment",
     "select_object",

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
+from io import TextIOWrapper
 from typing import Any
 
 from splatgraft.project.step_table import STEPS
@@ -66,6 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     # FFmpeg inside OpenCV prints lines of its own about videos that our one line explains
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    if isinstance(sys.stdout, TextIOWrapper):  # not every encoding of Windows has all letters of a file name
+        sys.stdout.reconfigure(errors="backslashreplace")
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
         print(_help(_HEAD, _first_words()) + _TAIL)

@@ -205,7 +205,7 @@ def _run(job: Job, advance: Callable[[int, str], None], say: Callable[[str], Non
         if code != 0 or not job.output.is_file():
             last = last_line(log) or "no message"
             raise ValueError(f"{job.photos}: expected COLMAP to finish, found exit code {code}: {last}")
-    return json.loads(job.output.read_text())
+    return json.loads(job.output.read_text(encoding="utf-8"))
 
 
 def _posed_images(

@@ -62,7 +62,8 @@ class Try:
         if _quality(project) == "draft" and not self.draft:
             console.say(f"{page}: the draft; the place at standard quality follows and replaces it, or Ctrl-C keeps it")
             with atomic_write(project) as stream:
-                stream.write(with_keys(project.read_text(), "reconstruct", {"quality": _FINER["draft"]}).encode())
+                text = project.read_text(encoding="utf-8")
+                stream.write(with_keys(text, "reconstruct", {"quality": _FINER["draft"]}).encode())
             run_steps(project, console, accept_doubtful=True)
         for line in refinements(read_flow(project), folder):
             console.say(line)

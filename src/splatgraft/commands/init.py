@@ -1,7 +1,6 @@
 """The command `init`: a folder with a commented project.toml."""
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from splatgraft.project.project_file import TEMPLATE
 from splatgraft.project.step import Positional
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.runtime.console import Console
-from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.files import atomic_write, relative_name
 from splatgraft.workflow.project_reference import full_project_text
 
 
@@ -62,7 +61,7 @@ class Init:
 
     def _key(self, capture: Path) -> str:
         # a JSON string is a TOML string
-        return f"{'scene' if is_scene(capture) else 'capture'} = {json.dumps(os.path.relpath(capture, self.folder))}"
+        return f"{'scene' if is_scene(capture) else 'capture'} = {json.dumps(relative_name(capture, self.folder))}"
 
 
 COMMAND = Init

@@ -1,18 +1,15 @@
-"""The command `light`: the estimated light at a place of a target as an environment map and a list of lamps."""
+"""The command `light`: the estimated light at a place of a target as an environment map, with or beside its lamps."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import write_radiance
-from splatgraft.core.rotations import rotation_between
 from splatgraft.folders.clock_sun import read_clock_sun
 from splatgraft.folders.composite_folder import read_composite
 from splatgraft.formats import is_scene, read_cameras, read_gaussians
@@ -20,8 +17,8 @@ from splatgraft.project.layout import CAMERAS_FILE, PROJECT_FILE, SCENE_FILE
 from splatgraft.project.step import Positional
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.description import describe_light
-from splatgraft.relighting.light.estimate import environment_radiance, equirectangular_directions, estimate_light
-from splatgraft.relighting.light.light import Light, light_to_json
+from splatgraft.relighting.light.environment import environment_light, place_at, upright_from_capture
+from splatgraft.relighting.light.light import light_to_json
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.scene_light import place_of
 from splatgraft.runtime.console import Console
@@ -29,19 +26,14 @@ from splatgraft.runtime.files import atomic_write
 from splatgraft.steps.relight import Relight
 from splatgraft.workflow.flow import read_flow
 
-_RADIUS = 1 / 8
-"""Radius of a place without an object, over the cameras' median distance. Evidence is taken within 8 radii, which then
-covers the whole region that the cameras look at."""
 _MIN_HEIGHT, _MAX_HEIGHT = 16, 4096  # rows of the map
-_BLENDER_FROM_DOWN_Y = torch.tensor([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
-"""Rotation from the axes of a capture whose up is -y to those of Blender after it opened the exported .glb."""
 
 
 @dataclass(frozen=True)
 class LightAt:
     """Write the light at a place of a target, to light meshes in other programs: an environment map (.hdr) of the
     ambient light and the scene's own radiance, and beside it a .json with the lamps (sun, windows, lamps). Use both:
-    the map is without the lamps, so nothing is counted twice.
+    the map is without the lamps, so nothing is counted twice. With --lamps map the map has them, and there is no .json.
 
     The map is equirectangular, as Blender's World expects it: the top row is +z, the middle column +x, columns to the
     right turn towards -y. It holds linear Rec. 709 radiance in the units of the capture, in which a white sky has 1;
@@ -51,7 +43,10 @@ class LightAt:
     target: Positional
     """A project (its folder or project.toml); or a scene file or a folder with scene.ply, together with --cameras."""
     out: Path = Path("light.hdr")
-    """The environment map; the lamps are written beside it, with the suffix .json."""
+    """The environment map."""
+    lamps: Literal["file", "map"] = "file"
+    """file: the lamps are written beside the map, with the suffix .json, for sharp shadows. map: each lamp is in the
+    map, as a disc at least one degree wide with all its energy, so that one file lights a scene in any program."""
     at: tuple[float, float, float] | None = None
     """The place, x y z in the axes and units of the target's capture; the middle of the placed objects if not
     given."""
@@ -82,22 +77,28 @@ class LightAt:
         captured = CapturedScene(scene, cameras, clock)
         place = self._place(step, spheres, cameras)
         up = captured.up
-        turn = None if self.frame == "capture" else _BLENDER_FROM_DOWN_Y @ rotation_between(up, -torch.eye(3)[1])
-        directions = equirectangular_directions(self.height)
-        directions = directions if turn is None else directions @ turn
+        turn = torch.eye(3) if self.frame == "capture" else upright_from_capture(up)
+        given, through = step.given(), step.options.sun_through
         with console.bar("light"):
-            light, radiance = _light_at(step, captured, place, directions)
-        write_radiance(self.out, radiance)
-        lamps = self.out.with_suffix(".json")
-        with atomic_write(lamps) as stream:
-            stream.write(light_to_json(light, world_from_capture=turn).encode())
+            found = environment_light(
+                captured, place, map_from_capture=turn, height=self.height, given=given, sun_through=through
+            )
+        if isinstance(found, NoLight):
+            raise ValueError(f"--at: expected a place with light around it, found none. {found.reason}")
+        light, lamps = found.light, self.out.with_suffix(".json")
+        write_radiance(self.out, found.radiance if self.lamps == "file" else found.with_lamps())
+        if self.lamps == "file":
+            with atomic_write(lamps) as stream:
+                axes = None if self.frame == "capture" else turn
+                stream.write(light_to_json(light, world_from_capture=axes).encode())
         console.say(
             f"The light at {', '.join(f'{v:.3g}' for v in place.center.tolist())}: {describe_light(light, up)}."
         )
         if clock is not None:
             console.say(f"By the clock of the target's photos: {clock.describe(cameras)}.")
         console.result(self.out)
-        console.result(lamps)
+        if self.lamps == "file":
+            console.result(lamps)
         return 0
 
     def _step(self) -> Relight:
@@ -127,8 +128,7 @@ class LightAt:
         if self.at is None:
             found = place_of(spheres)
             return found if self.radius is None else BoundingSphere(found.center, self.radius)
-        center = torch.tensor(self.at)
-        return BoundingSphere(center, self.radius or _RADIUS * float((cameras.centers - center).norm(dim=1).median()))
+        return place_at(self.at, cameras, self.radius)
 
 
 def _scene_of(step: Relight) -> tuple[Gaussians, list[BoundingSphere]]:
@@ -138,22 +138,6 @@ def _scene_of(step: Relight) -> tuple[Gaussians, list[BoundingSphere]]:
     composite = read_composite(step.target, step.placement)
     placed = [one.in_target() for one in composite.objects if one.gaussians.count]
     return composite.target.select(~composite.erased), [bounding_sphere(one) for one in placed]
-
-
-def _light_at(
-    step: Relight, captured: CapturedScene, place: BoundingSphere, directions: Float[Tensor, "h w 3"]
-) -> tuple[Light, Float[Tensor, "h w 3"]]:
-    """Return the light that `relight` would use, and the radiance from `directions` without the light's sources.
-
-    If the light was given, its ambient light is the radiance.
-    """
-    given = step.given()
-    if given is not None:
-        return given, given.ambient_radiance(directions.reshape(-1, 3)).reshape(directions.shape)
-    found = estimate_light(captured, place, sun_through=step.options.sun_through)
-    if isinstance(found, NoLight):
-        raise ValueError(f"--at: expected a place with light around it, found none. {found.reason}")
-    return found.light, environment_radiance(found, captured, place, directions)
 
 
 COMMAND = LightAt

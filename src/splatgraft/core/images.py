@@ -284,13 +284,19 @@ def write_image(path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, 
         Image.fromarray(array).save(stream, format=kind, **_WRITE_OPTIONS.get(kind, {}))
 
 
-def write_radiance(path: Path, radiance: Float[Tensor, "h w 3"]) -> None:
+def write_radiance(path: Path | str, radiance: Float[Tensor, "h w 3"]) -> None:
     """Write linear rgb as a Radiance .hdr, rounded to 8 bits of each pixel's largest channel.
 
     Args:
         path: A file that ends in .hdr; it appears whole or not at all.
         radiance: Linear rgb, at least 0.
+
+    Raises:
+        ValueError: The name has another suffix.
     """
+    path = Path(path)
+    if path.suffix.lower() != ".hdr":
+        raise ValueError(f"{path}: expected a name that ends in .hdr, found {path.name}")
     encoded, data = cv2.imencode(".hdr", np.ascontiguousarray(radiance.flip(-1).numpy()))
     assert encoded
     with atomic_write(path) as stream:

@@ -7,7 +7,6 @@ unbounded, needs little memory, and survives the end of the editor.
 import base64
 import hashlib
 import json
-import os
 import zlib
 from collections import OrderedDict
 from dataclasses import asdict, dataclass
@@ -24,7 +23,7 @@ from splatgraft.project.layout import EDITOR_FOLDER
 from splatgraft.project.placement import ObjectPlacement
 from splatgraft.project.prompts import prompts_from_json, prompts_to_json
 from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
-from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.files import atomic_write, relative_name
 
 _HISTORY_FILE, _STATES_FOLDER = "history.json", "states"
 _IN_MEMORY = 20
@@ -125,7 +124,7 @@ def _to_json(state: EditState, project_folder: Path) -> dict[str, Any]:
                 "scale": item.target_from_object.scale,
                 "rotation": item.target_from_object.rotation.tolist(),
                 "translation": item.target_from_object.translation.tolist(),
-                "object": None if item.object_path is None else os.path.relpath(item.object_path, project_folder),
+                "object": None if item.object_path is None else relative_name(item.object_path, project_folder),
             }
             for item in state.objects
         ]

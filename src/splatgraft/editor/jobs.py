@@ -165,7 +165,7 @@ class Jobs:
 
     def _read(self) -> JobState | None:
         try:
-            found = json.loads((self.folder / _STATE_FILE).read_text())
+            found = json.loads((self.folder / _STATE_FILE).read_text(encoding="utf-8"))
             found["plan"] = tuple(PlannedStep(**step) for step in found["plan"])
             state = JobState(**found | {name: tuple(found[name]) for name in ("command", "said")})
         except (OSError, ValueError, KeyError, TypeError, AttributeError):

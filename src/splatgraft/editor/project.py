@@ -1,6 +1,5 @@
 """The project that is edited: its files by project.toml, which steps are stale, and the commands that run them."""
 
-import os
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -24,7 +23,7 @@ from splatgraft.project.layout import (
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LayerWeights, RelightOptions
 from splatgraft.runtime.console import Console
-from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.files import atomic_write, relative_name
 from splatgraft.steps.capture import Capture
 from splatgraft.steps.compose import Compose
 from splatgraft.steps.relight import Relight
@@ -149,7 +148,7 @@ class Project:
         Init(folder=self.file.parent, source=captures[0], target=captures[1]).execute(Console())
         for side, scene in zip(("source", "target"), scenes, strict=True):
             if scene is not None:
-                self._set_keys(side, {"scene": os.path.relpath(scene, self.file.parent)})
+                self._set_keys(side, {"scene": relative_name(scene, self.file.parent)})
 
     def set_view(self, side: Side, views: RenderedViews) -> None:
         """Set how images of a scene without photographs are rendered."""

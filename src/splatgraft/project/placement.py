@@ -7,7 +7,6 @@
 x_in_target = scale * rotation @ x_in_object + translation. erased.npy has one bool per Gaussian of the target.
 """
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.formats.json_file import array, excerpt, load, number, save
 from splatgraft.project.gaussian_flags import read_flags, write_flags
 from splatgraft.project.layout import ERASED_FILE
+from splatgraft.runtime.files import relative_name
 
 _DEFAULTS = {"object": None, "scale": 1.0, "rotation": [1, 0, 0, 0], "translation": [0, 0, 0]}
 _RIGID = 1e-4  # largest entry of R R^T - I; accepts files with six digits, refuses a scale or shear in the matrix
@@ -64,7 +64,7 @@ def write_placement(path: Path, placement: Placement) -> None:
     """Write placement.json, and erased.npy beside it if anything is erased; reading restores both exactly."""
     entries = []
     for item in placement.objects:
-        named = {} if item.object_path is None else {"object": os.path.relpath(item.object_path, path.parent)}
+        named = {} if item.object_path is None else {"object": relative_name(item.object_path, path.parent)}
         move = item.target_from_object
         place = {"scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()}
         entries.append(named | place)

@@ -102,7 +102,7 @@ def read_record(folder: Path) -> Record | None:
     if not path.is_file():
         return None
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         inputs = {role: tuple(tuple(e) for e in files) for role, files in found.pop("inputs").items()}
         warnings = tuple(_note(**warning) for warning in found.pop("warnings", ()))
         return Record(inputs=inputs, outputs=tuple(found.pop("outputs")), warnings=warnings, **found)
@@ -142,7 +142,7 @@ def write_record(folder: Path, record: Record) -> None:
 
 def _plain(note: Note) -> dict[str, Any]:
     """Return a warning as plain JSON, with its remedy if it has one."""
-    picture = None if note.picture is None else str(note.picture)
+    picture = None if note.picture is None else note.picture.as_posix()
     remedy = {"remedy": note.remedy} if note.remedy else {}
     return {"text": note.text, "picture": picture, "minor": note.level == "minor", **remedy}
 

@@ -1,6 +1,5 @@
 """The interface of a step and its execution: locked, timed, resumable, replacing the result folder as a whole."""
 
-import os
 import shutil
 import time
 from collections.abc import Generator, Mapping, Sequence
@@ -15,7 +14,7 @@ import tyro
 
 from splatgraft.project.record import STEP_FILE, Job, Record, read_record, write_record
 from splatgraft.runtime.console import Console
-from splatgraft.runtime.files import atomic_folder, atomic_write, room_on_disk, writable
+from splatgraft.runtime.files import atomic_folder, atomic_write, relative_name, room_on_disk, writable
 from splatgraft.runtime.note import Note
 from splatgraft.runtime.process import peak_memory_bytes, reset_peak_memory
 from splatgraft.runtime.progress import Progress
@@ -38,7 +37,7 @@ class FolderCheckpoint:
         """Open the checkpoint of an earlier run of the same job, or start an empty one."""
         self.folder = job.folder.with_name(f".{job.folder.name}.checkpoint")
         key, name = self.folder / "job", job.fingerprint
-        if not key.is_file() or key.read_text() != name:
+        if not key.is_file() or key.read_text(encoding="utf-8") != name:
             self.drop()
             self.folder.mkdir(parents=True)
             with atomic_write(key) as stream:
@@ -203,7 +202,7 @@ def replacing(job: Job, warned: Sequence[Note] = ()) -> Generator[Path]:
     start = time.monotonic()
     with atomic_folder(job.folder) as folder:
         yield folder
-        outputs = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+        outputs = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
         record = Record(
             step=job.step,
             version=version("splatgraft"),
@@ -223,7 +222,7 @@ def _recorded(note: Note, job: Job, new: Path) -> Note:
     if note.picture is None:
         return replace(note, remedy=remedy)
     base = new if note.picture.is_relative_to(new) else job.folder
-    return replace(note, remedy=remedy, picture=Path(os.path.relpath(note.picture, base)))
+    return replace(note, remedy=remedy, picture=Path(relative_name(note.picture, base)))
 
 
 def clear_leftovers(folder: Path) -> None:

@@ -185,12 +185,12 @@ def available_memory(device: str) -> int | None:
         return torch.cuda.mem_get_info(torch.device(device))[0]
     found = []
     if (table := Path("/proc/meminfo")).exists():
-        rows = dict(line.split(":", 1) for line in table.read_text().splitlines())
+        rows = dict(line.split(":", 1) for line in table.read_text(encoding="utf-8").splitlines())
         found.append(int(rows["MemAvailable"].split()[0]) * 1024)
     # a container's limit (cgroup v2)
     limit, used = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
-    if limit.exists() and limit.read_text().strip() != "max":
-        found.append(max(int(limit.read_text()) - int(used.read_text()), 0))
+    if limit.exists() and limit.read_text(encoding="utf-8").strip() != "max":
+        found.append(max(int(limit.read_text(encoding="utf-8")) - int(used.read_text(encoding="utf-8")), 0))
     return min(found, default=None)
 
 

@@ -77,16 +77,19 @@ def _exchange(a: Path, b: Path) -> bool:
 
 
 def _flush(folder: Path) -> None:
-    """Write all content to the disk before the rename, so that a power failure cannot leave empty files."""
-    on_windows = sys.platform == "win32"  # it opens no folders, and flushes only files that are open for writing
-    for path in [*folder.rglob("*"), folder]:
-        if on_windows and path.is_dir():
-            continue
-        descriptor = os.open(path, os.O_RDWR if on_windows else os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+    """Write all files to the disk before the rename, so that a power failure cannot leave empty files."""
+    for path in filter(Path.is_file, folder.rglob("*")):  # Windows opens no folders
+        with path.open("r+b") as stream:  # Windows flushes only files that are open for writing
+            os.fsync(stream.fileno())
+
+
+def relative_name(path: Path, folder: Path) -> str:
+    """Return the name of `path` relative to `folder`, with forward slashes; absolute if Windows has no relative one."""
+    try:
+        name = os.path.relpath(path, folder)
+    except ValueError:  # on another drive
+        name = os.path.abspath(path)
+    return name.replace(os.sep, "/")
 
 
 def is_writable(folder: Path) -> bool:

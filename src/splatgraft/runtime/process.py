@@ -57,7 +57,7 @@ def source_commit() -> str:
     """Return the git commit of this package's source, with `-dirty` if it was changed; `unknown` outside a checkout."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude=*"]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
     except OSError:
         return "unknown"
     return done.stdout.strip() or "unknown"
@@ -65,7 +65,7 @@ def source_commit() -> str:
 
 def last_line(log: Path) -> str:
     """Return the last line of `log` that is not blank, or an empty text."""
-    lines = log.read_text(errors="replace").strip().splitlines() if log.is_file() else []
+    lines = log.read_text(errors="replace", encoding="utf-8").strip().splitlines() if log.is_file() else []
     return lines[-1].strip() if lines else ""
 
 
@@ -118,7 +118,7 @@ def end_process(status: int) -> NoReturn:
 def reset_peak_memory() -> None:
     """Reset the peak of resident memory; only Linux can, elsewhere it counts from the start of the process."""
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # man proc: 5 resets VmHWM
+        Path("/proc/self/clear_refs").write_text("5", encoding="utf-8")  # man proc: 5 resets VmHWM
     except OSError:
         return
 
@@ -127,7 +127,7 @@ def peak_memory_bytes() -> int:
     """Return the peak of resident memory since the last reset, in bytes; 0 on Windows, which has no such count."""
     status = Path("/proc/self/status")
     if status.is_file():
-        for line in status.read_text().splitlines():
+        for line in status.read_text(encoding="utf-8").splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
     try:
@@ -143,6 +143,12 @@ def open_page(page: Path | str) -> bool:
 
     Text browsers are not used, because they would take over the terminal.
     """
+    if sys.platform == "win32":
+        try:
+            os.startfile(page)
+        except OSError:
+            return False
+        return True
     has_display = sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     opener = _OPENERS.get(sys.platform)
     if not has_display or opener is None:

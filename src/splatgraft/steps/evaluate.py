@@ -123,7 +123,7 @@ class Evaluate:
             metrics=metrics,
             changes={key: sum(c[key] for c in changes) / len(changes) for key in changes[0]} if changes else {},
             not_measured=missing,
-            light=self.light.read_text() if self.light is not None else "",
+            light=self.light.read_text(encoding="utf-8") if self.light is not None else "",
             steps=_step_times(self.project) if self.project is not None else (),
             machine=f"{os.cpu_count()} cores of {platform.machine()}, {device}",
             limits=_LIMITS if truth is None else (),

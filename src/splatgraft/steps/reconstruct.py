@@ -81,7 +81,7 @@ class Reconstruct:
             photo_of = dict(zip(capture.cameras.names, capture.image_paths, strict=True))
             for name, text in far_worse(metrics["psnr_by_view"]).items():
                 context.console.tell(Note(text, "warning", picture=photo_of[name]))
-            (folder / METRICS_FILE).write_text(json.dumps(metrics, indent=1))
+            (folder / METRICS_FILE).write_text(json.dumps(metrics, indent=1), encoding="utf-8")
 
 
 def far_worse(psnr_by_view: dict[str, float]) -> dict[str, str]:

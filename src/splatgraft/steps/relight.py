@@ -86,9 +86,9 @@ class Relight:
                 context.console.say(f"By the clock of the target's photos: {clock.describe(cameras)}.")
         write_gaussians(folder / SCENE_FILE, gaussians)
         write_flags(folder / IS_OBJECT_FILE, is_object)
-        (folder / LIGHT_TEXT_FILE).write_text("".join(f"{note.text}\n" for note in notes))
+        (folder / LIGHT_TEXT_FILE).write_text("".join(f"{note.text}\n" for note in notes), encoding="utf-8")
         if found is not None:
-            (folder / LIGHT_FILE).write_text(light_to_json(found))
+            (folder / LIGHT_FILE).write_text(light_to_json(found), encoding="utf-8")
         picture = folder / LIGHT_PICTURE
         context.console.tell(*(replace(note, picture=picture if picture.is_file() else None) for note in notes))
 
@@ -98,7 +98,7 @@ class Relight:
             return None
         if not self.given_light.is_file():
             raise ValueError(f"{self.given_light}: expected a light.json, found no such file")
-        return light_from_json(self.given_light.read_text(), name=str(self.given_light))
+        return light_from_json(self.given_light.read_text(encoding="utf-8"), name=str(self.given_light))
 
     def _sources(self) -> list[SourceScene | None]:
         source = None

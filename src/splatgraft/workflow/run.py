@@ -87,7 +87,7 @@ def _captures_ahead(
             command = [sys.executable, "-c", _PERFORM_ALONE, str(project), "" if out is None else str(out), name]
             pipe = subprocess.PIPE
             begun[name] = subprocess.Popen(
-                command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe, errors="replace"
+                command, stdin=pipe, stdout=subprocess.DEVNULL, stderr=pipe, encoding="locale", errors="replace"
             )
         yield begun
     finally:

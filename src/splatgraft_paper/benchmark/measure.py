@@ -78,7 +78,7 @@ class MeasureMethod:
         values = {name: _mean([row[name] for row in rows.values()]) for name in next(iter(rows.values()))}
         consistency = _consistency(self.truth, truth, images)
         record = {"values": {**values, **consistency}, "views": rows}
-        (folder / METRICS_FILE).write_text(json.dumps(record, indent=1, allow_nan=False))
+        (folder / METRICS_FILE).write_text(json.dumps(record, indent=1, allow_nan=False), encoding="utf-8")
 
     def _images(
         self, scene: Gaussians | None, truth: PosedImages, chosen: list[int]

@@ -141,7 +141,7 @@ class RelightForBenchmark:
             result = relight(composite, cameras, sources=[source], light=light)
             notes = result.report
             if result.light is not None:
-                (folder / LIGHT_FILE).write_text(light_to_json(result.light))
+                (folder / LIGHT_FILE).write_text(light_to_json(result.light), encoding="utf-8")
         write_gaussians(folder / SCENE_FILE, result.bake()[0])
         context.console.tell(*notes)
 

@@ -90,7 +90,7 @@ def measure_scene(run: BenchmarkRun, scene: GroundTruthScene, lpips: bool) -> No
         except ValueError as error:
             outcome["reason"] = str(error)
         out.parent.mkdir(parents=True, exist_ok=True)
-        run.outcome_file(scene, method).write_text(json.dumps(outcome))
+        run.outcome_file(scene, method).write_text(json.dumps(outcome), encoding="utf-8")
 
 
 def unmeasurable_metrics(folder: Path | None) -> dict[str, str]:
@@ -117,10 +117,10 @@ def collect_results(run: BenchmarkRun, missing: dict[str, str], failures: list[s
             file = run.outcome_file(scene, method)
             if not file.is_file():
                 continue
-            if "reason" in (outcome := json.loads(file.read_text())):
+            if "reason" in (outcome := json.loads(file.read_text(encoding="utf-8"))):
                 not_run.append(f"{method.name} on {scene.name} not run: {outcome['reason']}")
             else:
-                record = json.loads((out / METRICS_FILE).read_text())
+                record = json.loads((out / METRICS_FILE).read_text(encoding="utf-8"))
                 rows.append(Row(scene.name, method.name, record["values"], outcome["seconds"]))
                 counts.add(len(record["views"]))
                 if (disagreement := record["values"].get("disagreement_truth")) is not None:
@@ -142,8 +142,8 @@ def collect_results(run: BenchmarkRun, missing: dict[str, str], failures: list[s
 
 def write_benchmark_report(run: BenchmarkRun, found: Benchmark) -> None:
     """Write benchmark.json, benchmark.md and index.html."""
-    (run.out / "benchmark.json").write_text(json.dumps(as_json(found), indent=1, allow_nan=False))
-    (run.out / "benchmark.md").write_text(markdown(found))
+    (run.out / "benchmark.json").write_text(json.dumps(as_json(found), indent=1, allow_nan=False), encoding="utf-8")
+    (run.out / "benchmark.md").write_text(markdown(found), encoding="utf-8")
     views = []
     by_name = {scene.name: scene for scene in run.scenes}
     for scene in found.scenes:
@@ -160,7 +160,7 @@ def write_benchmark_report(run: BenchmarkRun, found: Benchmark) -> None:
             relative = {name: str(path.relative_to(run.out)) for name, path in files.items()}
             height, width = truth.image(index).shape[:2]
             views.append(ViewFiles(f"{scene} {stem}", held_out=True, files=relative, width=width, height=height))
-    (run.out / "index.html").write_text(_benchmark_html(found, views))
+    (run.out / "index.html").write_text(_benchmark_html(found, views), encoding="utf-8")
 
 
 def _distributions(run: BenchmarkRun) -> dict[str, dict[str, float | None]]:

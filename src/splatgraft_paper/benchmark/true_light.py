@@ -205,7 +205,7 @@ def read_probe(panorama: Path, suns: Path) -> Light:
     """Read the light measured at a place: a panorama without the suns (.npy), and a list of suns (.json)."""
     try:
         radiance = torch.from_numpy(np.load(panorama, allow_pickle=False)).float()
-        return light_from_probe(radiance, json.loads(suns.read_text()))
+        return light_from_probe(radiance, json.loads(suns.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{panorama}, {suns.name}: expected a measured light, found {error}") from error
 
@@ -213,11 +213,11 @@ def read_probe(panorama: Path, suns: Path) -> Light:
 def write_true_light(scene: Path) -> None:
     """Write true_light.json from probe.npy and suns.json of a gathered scene."""
     light = read_probe(scene / "probe.npy", scene / "suns.json")
-    (scene / TRUE_LIGHT_FILE).write_text(light_to_json(light))
+    (scene / TRUE_LIGHT_FILE).write_text(light_to_json(light), encoding="utf-8")
 
 
 def read_true_light(path: Path) -> Light:
     """Read true_light.json."""
     if not path.is_file():
         raise ValueError(f"{path}: expected the scene's true light, found none")
-    return light_from_json(path.read_text(), name=str(path))
+    return light_from_json(path.read_text(encoding="utf-8"), name=str(path))

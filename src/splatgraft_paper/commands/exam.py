@@ -115,7 +115,7 @@ class Exam:
             for path in sorted(Path(package.__file__ or "").parent.rglob("*.py")):
                 text.update(path.read_bytes())
         file, key = out / "results" / f"{folder.name}.json", text.hexdigest()
-        if file.is_file() and (record := json.loads(file.read_text()))["key"] == key:
+        if file.is_file() and (record := json.loads(file.read_text(encoding="utf-8")))["key"] == key:
             return SceneResult.from_json(record["result"])
         started = time.perf_counter()
         scene = read_scene(folder, (self.work or out / "work") / folder.name, self._options, console)
@@ -155,8 +155,8 @@ class Exam:
             "scenes": [one.as_json() for one in results],
         }
         out.mkdir(parents=True, exist_ok=True)
-        (out / "exam.json").write_text(json.dumps(record, indent=1, allow_nan=False))
-        (out / "exam.md").write_text(text)
+        (out / "exam.json").write_text(json.dumps(record, indent=1, allow_nan=False), encoding="utf-8")
+        (out / "exam.md").write_text(text, encoding="utf-8")
 
     def _title(self) -> str:
         if self.number is None:

@@ -150,7 +150,7 @@ def plan(which: BenchmarkScene, size: BenchmarkSize) -> tuple[Job, Job]:
 
 def rendered_cameras(out: Path, names: tuple[str, ...]) -> Cameras:
     """Read the cameras of a rendered job and convert them from OpenGL to OpenCV axes."""
-    found = json.loads((out / "cameras.json").read_text())
+    found = json.loads((out / "cameras.json").read_text(encoding="utf-8"))
     poses = torch.tensor(found["poses"], dtype=torch.float64)
     poses[:, :3, 1:3] *= -1
     width, height = found["width"], found["height"]
@@ -195,7 +195,7 @@ def sparse_points(
 
 def gather_capture(rendered: Path, take: str, out: Path, *, passes: tuple[str, ...], points: bool) -> None:
     """Copy one take into a capture: images/, a folder per pass, transforms.json, points.ply."""
-    count = len(json.loads((rendered / "cameras.json").read_text())["poses"])
+    count = len(json.loads((rendered / "cameras.json").read_text(encoding="utf-8"))["poses"])
     stems = tuple(f"{i:04d}" for i in range(count))
     for folder, suffix, ending in _PASS_FILES:
         if folder in passes:
@@ -235,7 +235,7 @@ def gather(which: BenchmarkScene, target_render: Path, source_render: Path, out:
     ):
         shutil.copyfile(given, out / name)
     record = {"kind": which.kind, "pose_deg": which.pose_deg, "seed": which.seed, **scene.notes}
-    (out / "scene.json").write_text(json.dumps(record, indent=1) + "\n")
+    (out / "scene.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
 def find_defect(folder: Path) -> str | None:

@@ -100,11 +100,11 @@ def render_job(job: Job, out: Path, blender_python: Path) -> None:
         return
     out.mkdir(parents=True, exist_ok=True)
     description = out / "job.json"
-    description.write_text(_description(job, out.resolve()))
+    description.write_text(_description(job, out.resolve()), encoding="utf-8")
     log = out / "render.log"
     code = run_logged([str(blender_python), str(_WORKER), str(description)], log)
     if not job.is_done(out):
-        tail = log.read_text(errors="replace").strip().splitlines() or [""]
+        tail = log.read_text(errors="replace", encoding="utf-8").strip().splitlines() or [""]
         said = next((line for line in reversed(tail) if "Error" in line and "freed" not in line), tail[-1])
         raise ValueError(f"{log}: expected Blender to render every picture, found exit code {code}: {said}")
 
@@ -171,7 +171,7 @@ def write_failures(out: Path, failures: list[str], console: Console) -> None:
     path = out / "failures.txt"
     path.unlink(missing_ok=True)
     if failures:
-        path.write_text("\n".join(failures) + "\n")
+        path.write_text("\n".join(failures) + "\n", encoding="utf-8")
         for failure in failures[:10]:
             console.say(failure)
         console.say(f"{len(failures)} failures, all in {path}")

@@ -130,7 +130,7 @@ def samples_in(folder: Path) -> list[PairSample]:
     """List all pairs of a rendered folder, from its job.json."""
     path = folder / "job.json"
     try:
-        job = json.loads(path.read_text())
+        job = json.loads(path.read_text(encoding="utf-8"))
         takes, cameras = [take["name"] for take in job["takes"]], len(job["cameras"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected the description of a render job, found {error}") from error
@@ -170,7 +170,7 @@ def write_manifest(out: Path, folders: Sequence[Path]) -> tuple[int, list[str]]:
     """Check every pair, write manifest.jsonl, and return the number of sound pairs and the defects of the others."""
     defects, lines = [], []
     for folder in folders:
-        provenance = json.loads((folder / "job.json").read_text()).get("provenance", {})
+        provenance = json.loads((folder / "job.json").read_text(encoding="utf-8")).get("provenance", {})
         for sample in samples_in(folder):
             if defect := find_defect(sample):
                 defects.append(defect)
@@ -188,7 +188,7 @@ def read_manifest(out: Path) -> list[PairSample]:
     if not path.is_file():
         raise ValueError(f"{path}: expected the manifest of rendered pairs, found none (splatgraft paper synth pairs)")
     samples = []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         try:
             entry = json.loads(line)
             samples.append(PairSample(out / entry["folder"], int(entry["camera"]), entry["object"], entry["light"]))

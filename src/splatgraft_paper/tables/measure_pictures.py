@@ -81,7 +81,7 @@ class MeasurePictures:
             "resolution": sorted(sizes),
         }
         record = {"values": values, "views": rows, "protocol": protocol}
-        (folder / METRICS_FILE).write_text(json.dumps(record, indent=1, allow_nan=False))
+        (folder / METRICS_FILE).write_text(json.dumps(record, indent=1, allow_nan=False), encoding="utf-8")
 
     def views(self) -> "ChosenViews":
         """Choose the views to measure."""

@@ -49,8 +49,8 @@ def write_paper_report(out: Path, results: PaperResults) -> Path:
     shown = [f"![{path.stem}]({path.relative_to(out).as_posix()})" for path in figures]
     text = [*(table.markdown() for table in tables), *shown, "\n".join(f"- {note}" for note in notes)]
     out.mkdir(parents=True, exist_ok=True)
-    (out / "paper.md").write_text("\n\n".join(text) + "\n")
-    (out / "paper.json").write_text(json.dumps(_as_json(results, notes), indent=1, allow_nan=False))
+    (out / "paper.md").write_text("\n\n".join(text) + "\n", encoding="utf-8")
+    (out / "paper.json").write_text(json.dumps(_as_json(results, notes), indent=1, allow_nan=False), encoding="utf-8")
     images = "".join(
         f'<section><h2>Figure: {path.stem}</h2><img src="{path.relative_to(out).as_posix()}" alt="{path.stem}" '
         f'style="max-width:100%"></section>'
@@ -60,7 +60,10 @@ def write_paper_report(out: Path, results: PaperResults) -> Path:
     body = "".join(map(table_section, tables)) + images
     body += f"<section><h2>Protocol</h2><ul>{items}</ul></section>"
     page = out / "index.html"
-    page.write_text(html_page("The paper's tables", "Published numbers beside those measured here.", body, views=()))
+    page.write_text(
+        html_page("The paper's tables", "Published numbers beside those measured here.", body, views=()),
+        encoding="utf-8",
+    )
     return page
 
 

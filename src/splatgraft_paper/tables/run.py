@@ -169,7 +169,7 @@ def _measure(
     truth, weights = scene.folders["truth"], run.ours.methods.weights
     step = MeasurePictures(folder, truth, out, weights, found.lpips, run.all_views)
     perform_if_stale(step, found.console)
-    record = json.loads((out / METRICS_FILE).read_text())
+    record = json.loads((out / METRICS_FILE).read_text(encoding="utf-8"))
     found.measured.append(Measured(scene, method, record["values"], record["protocol"], seconds))
     for pose in {"", scene.pose}:
         found.pools.setdefault((scene.kind, pose, method), []).append(step)

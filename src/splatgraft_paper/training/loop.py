@@ -382,12 +382,12 @@ class _Loop:
     def log(self) -> Generator[TextIO]:
         """Open the log with the lines of the steps so far; the other processes log to nowhere."""
         if not self.is_first:
-            with open(os.devnull, "a") as stream:
+            with open(os.devnull, "a", encoding="utf-8") as stream:
                 yield stream
             return
         (self._folder / "validation").mkdir(parents=True, exist_ok=True)
         path, remaining = self._folder / LOG_FILE, []
-        for line in path.read_text().splitlines() if path.is_file() else []:
+        for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
             try:
                 if json.loads(line)["step"] <= self.step:
                     remaining.append(line)
@@ -429,7 +429,7 @@ class _Loop:
         with _quiet():
             save(self._state(), checkpoint_id=partial, no_dist=self._processes.num_processes == 1)
         if self.is_first:
-            (partial / _JOB_FILE).write_text(json.dumps(self._job()))
+            (partial / _JOB_FILE).write_text(json.dumps(self._job()), encoding="utf-8")
             shutil.rmtree(path, ignore_errors=True)
             partial.rename(path)
             for old in list_states(self._folder)[:-_KEPT_STATES]:
@@ -441,7 +441,7 @@ class _Loop:
         states = list_states(self._folder)
         self._processes.wait_for_everyone()  # no process may change the states before all have listed them
         for path in reversed(states):
-            saved, current = json.loads((path / _JOB_FILE).read_text()), self._job()
+            saved, current = json.loads((path / _JOB_FILE).read_text(encoding="utf-8")), self._job()
             if changed := [name for name in current if saved.get(name) != current[name]]:
                 raise ValueError(
                     f"{self._folder}: expected the same training to resume, found {changed[0]} "

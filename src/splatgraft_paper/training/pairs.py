@@ -140,7 +140,7 @@ def open_relit(folder: Path) -> PairFolder:
             f"{path}: expected the manifest of generated pairs, found none (splatgraft paper synth generated)"
         )
     pairs: list[PairFiles] = []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         try:
             entry = json.loads(line)
             inside = folder / entry["folder"]
@@ -173,13 +173,15 @@ def write_sample(folder: Path, sample: RelitSample, record: Mapping[str, Any]) -
         write_image(new / "mask.png", sample.mask)
         for i, picture in enumerate(sample.relit):
             write_image(new / f"relit_{i}.png", picture)
-        (new / RECORD_FILE).write_text(json.dumps({**record, "relit": len(sample.relit)}, indent=1) + "\n")
+        (new / RECORD_FILE).write_text(
+            json.dumps({**record, "relit": len(sample.relit)}, indent=1) + "\n", encoding="utf-8"
+        )
 
 
 def write_relit_manifest(out: Path) -> int:
     """Write one line per complete sample, and return their number."""
     lines = [
-        json.dumps({"folder": path.parent.name, **json.loads(path.read_text())})
+        json.dumps({"folder": path.parent.name, **json.loads(path.read_text(encoding="utf-8"))})
         for path in sorted(out.glob(f"*/{RECORD_FILE}"))
     ]
     with atomic_write(out / MANIFEST_FILE) as stream:

@@ -52,7 +52,7 @@ class Recipe:
             known = ", ".join(sorted(path.stem for path in _FOLDER.glob("*.toml")))
             raise ValueError(f"--recipe: expected a file or one of {known}; found {name}")
         try:
-            found = tomllib.loads(path.read_text())
+            found = tomllib.loads(path.read_text(encoding="utf-8"))
             if "recipe" in found:
                 return Recipe.read(found["recipe"])._without(found["without"], path.stem, found["title"])
             sources = [RecipeSource(option, **source) for option, source in found["sources"].items()]

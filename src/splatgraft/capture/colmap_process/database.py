@@ -195,7 +195,7 @@ def _promising_pairs(job: Job, database: Path) -> Path:
         if len(own) < _PRESELECT_PARTNERS:
             pairs |= {(min(i, other), max(i, other)) for other in names if other != i}
     partial = fresh(listed.with_suffix(".partial"))
-    partial.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in sorted(pairs)))
+    partial.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in sorted(pairs)), encoding="utf-8")
     os.replace(partial, listed)
     return listed
 

@@ -65,7 +65,7 @@ def _end_with_parent() -> None:
 def _write(path: Path, content: dict[str, Any]) -> None:
     """Write JSON completely or not at all."""
     partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(content))
+    partial.write_text(json.dumps(content), encoding="utf-8")
     os.replace(partial, path)
 
 
@@ -129,7 +129,7 @@ def _answer(job: Job, clock: Clock, name: str, level: str) -> Answer:
         found = best_of(matched, [*models, *better], len(job.names))
         found["moved"] = moved_photos(_database(job, _MASKED), found, Path(job.masks)) if job.masks else []
         _write(path, found | {"models": len(models), "method": method, "database": name})
-    answer = json.loads(path.read_text())
+    answer = json.loads(path.read_text(encoding="utf-8"))
     return answer | {"images": [image for image in answer["images"] if image["name"] not in answer["moved"]]}
 
 

@@ -4,7 +4,6 @@ cameras.json, which the original 3DGS code writes beside a scene, is read as wel
 """
 
 import math
-import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures.views import CaptureFile, ViewRecord, existing_file, rigid, view_or_reason
 from splatgraft.formats.json_file import array, excerpt, load, number, save, text, whole_side
 from splatgraft.formats.scenes.ply import read_points, write_points
+from splatgraft.runtime.files import relative_name
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
@@ -155,7 +155,7 @@ def write_capture(folder: Path, posed_images: PosedImages) -> None:
 
 def _relative(path: Path, folder: Path) -> str:
     """Make a path relative, with resolved folders; a symbolic link keeps its own name."""
-    return (Path(os.path.relpath(path.parent.resolve(), folder.resolve())) / path.name).as_posix()
+    return relative_name(path.parent.resolve() / path.name, folder.resolve())
 
 
 def _frame(cameras: Cameras, index: int, distortion: Distortion | None) -> dict[str, Any]:

@@ -153,7 +153,7 @@ def declared_variant(folder: Path) -> str | None:
     if not path.is_file():
         return None
     try:
-        return _known(json.loads(path.read_text())["variant"], path)
+        return _known(json.loads(path.read_text(encoding="utf-8"))["variant"], path)
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected a variant, {' or '.join(VARIANTS)}, found {one_line(error)}") from error
 
@@ -170,7 +170,7 @@ def _known(variant: str | None, place: Path) -> Variant:
 def read_config(path: Path, kind: str) -> dict[str, Any]:
     """Read the diffusers config of a model of class `kind`."""
     try:
-        config = json.loads(path.read_text())
+        config = json.loads(path.read_text(encoding="utf-8"))
         found = config["_class_name"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: expected the config of a {kind}, found {one_line(error)}") from error

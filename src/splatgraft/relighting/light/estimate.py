@@ -5,10 +5,6 @@
 3. Turn peaks of that radiance into sources, and the rest into ambient light of degree 2.
 4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it.
 5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
-
-The ambient light is also available as an environment map for programs that light meshes. Photographed directions have
-the scene's own radiance in full resolution, all others the radiance of the estimate. Sources are left out: their
-directions get the radiance of their neighbours.
 """
 
 import math
@@ -30,14 +26,10 @@ from splatgraft.relighting.light.light import Light, LightSource, angular_radius
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
     FARTHEST,
-    NEAREST,
     SOLID_ANGLE,
     NoLight,
-    cube_pixels,
-    nearest_directions,
     panorama_at,
     place_surroundings,
-    render_panorama,
     surroundings_at,
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
@@ -65,10 +57,6 @@ _UNSEEN_RADIUS_DEG = 1.0  # angular radius of a source that no camera saw, besid
 # the view towards a source; set by hand
 _SOURCE_QUANTILE = 0.25  # quantile of the depths in that view that is the distance to the source
 _BLOCKERS_WITHIN = 0.7  # share of that distance within which occluders block the source
-
-# the environment map
-_SMOOTH_RAD = math.radians(8.0)  # width of the kernel that interpolates between `DIRECTIONS`; set by hand
-_CHUNK = 65_536  # directions interpolated at a time; bounds memory
 
 
 @dataclass(frozen=True)
@@ -263,65 +251,3 @@ def with_blocker_distances(light: Light, scene: Gaussians, place: BoundingSphere
         distance = float(rendered.depth[visible].quantile(_SOURCE_QUANTILE)) if bool(visible.any()) else math.inf
         sources.append(replace(source, blockers_within=_BLOCKERS_WITHIN * distance))
     return replace(light, sources=tuple(sources))
-
-
-def equirectangular_directions(height: int) -> Float[Tensor, "h w 3"]:
-    """Return the unit directions of an environment map's pixels in the layout of Blender's world.
-
-    The map is twice as wide as high. Its top row looks along +z, its middle column along +x, and columns to the right
-    turn towards -y, seen from inside.
-    """
-    polar = math.pi * (torch.arange(height) + 0.5)[:, None] / height
-    azimuth = 2 * math.pi * (0.5 - (torch.arange(2 * height) + 0.5) / (2 * height))[None]
-    return torch.stack([polar.sin() * azimuth.cos(), polar.sin() * azimuth.sin(), polar.cos() + 0 * azimuth], -1)
-
-
-def environment_radiance(
-    found: EstimatedLight, captured: CapturedScene, place: BoundingSphere, directions: Float[Tensor, "h w 3"]
-) -> Float[Tensor, "h w 3"]:
-    """Compute the environment map at a place, without the estimate's sources.
-
-    Args:
-        found: The estimate at `place`.
-        captured: The scene without the object.
-        place: The object's bounding sphere; Gaussians nearer to its middle than half its radius are left out.
-        directions: Unit, world frame.
-
-    Returns:
-        Linear rgb radiance, at least 0.
-    """
-    height, width, _ = directions.shape
-    flat, face = directions.reshape(-1, 3), max(height, 1)
-    cube = render_panorama(captured.usable.gaussians, place.center, size=face, nearest=NEAREST * place.radius)
-    shown = cube.radiance.reshape(-1, 3)[cube_pixels(flat, face)]
-    around, rest = found.evidence.around, found.rest()
-    # photographed sources are limited to the radiance around them
-    is_cut = (rest < around.radiance).any(1, keepdim=True)
-    limit = torch.where(is_cut, rest, math.inf)[nearest_directions(flat)]
-    smooth = _interpolated(torch.cat([around.seen[:, None], _hidden(found, rest)], 1), flat)
-    radiance = torch.minimum(smooth[:, :1] * shown, limit) + smooth[:, 1:]
-    return radiance.reshape(height, width, 3)
-
-
-def _hidden(found: EstimatedLight, rest: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
-    """Return the part of `rest` that no camera recorded.
-
-    A sun found from shadows dims the ambient light, so that the surface keeps its brightness. Recorded radiance stays,
-    so the hidden part alone is dimmed until the ambient irradiance on the surface agrees, or to 0.
-    """
-    seen = found.evidence.around.radiance
-    hidden = (rest - seen).clamp_min(0)
-    up = found.evidence.up if found.sun is None else found.sun.normal.to(DIRECTIONS)
-    dimming = float(found.light.ambient.norm() / found.mean.ambient.norm().clamp_min(1e-9))
-    cosine = (DIRECTIONS @ up).clamp_min(0)
-    by_all, by_seen, by_hidden = (cosine @ (part @ LUMINANCE) for part in (rest, torch.minimum(rest, seen), hidden))
-    return hidden * ((dimming * by_all - by_seen) / by_hidden.clamp_min(1e-9)).clamp_min(0)
-
-
-def _interpolated(values: Float[Tensor, "k c"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:
-    """Interpolate `values` of all `DIRECTIONS` smoothly."""
-    parts = []
-    for part in directions.split(_CHUNK):
-        weights = ((part @ DIRECTIONS.T - 1) / _SMOOTH_RAD**2).exp()
-        parts.append(weights @ values / weights.sum(1, keepdim=True))
-    return torch.cat(parts)

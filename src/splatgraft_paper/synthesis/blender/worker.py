@@ -60,7 +60,7 @@ def _exposure(job, take, cameras):
     path = os.path.join(job["out"], "exposure.json")
     known = {}
     if os.path.exists(path):
-        with open(path) as source:
+        with open(path, encoding="utf-8") as source:
             known = json.load(source)
     group = take["exposure_group"]
     if group not in known:
@@ -77,7 +77,7 @@ def _exposure(job, take, cameras):
         mean, high = np.mean(levels, 0) if levels else (0.18, 1.0)
         # the mean becomes mid grey; the exposure is lower if more than three per cent of the pixels would clip
         known[group] = float(min(_MID_GREY / max(mean, 1e-4), _HIGHLIGHT / max(high, 1e-4)))
-        with open(path + ".partial", "w") as out:
+        with open(path + ".partial", "w", encoding="utf-8") as out:
             json.dump(known, out)
         os.replace(path + ".partial", path)
     return known[group]
@@ -102,19 +102,19 @@ def _write(folder, name, take, arrays, exposure):
 
 
 def _done(folder, index, seconds):
-    with open(os.path.join(folder, f"{index:04d}.done"), "w") as out:
+    with open(os.path.join(folder, f"{index:04d}.done"), "w", encoding="utf-8") as out:
         out.write(f"{seconds:.2f}\n")
 
 
 def main(path):
     """Render what is missing of the job at `path`."""
-    with open(path) as source:
+    with open(path, encoding="utf-8") as source:
         job = json.load(source)
     os.makedirs(job["out"], exist_ok=True)
     scene_things, objects, cameras = _populate(job)
     passes.configure(job["width"], job["height"], job["samples"], job.get("seed", 0))
     poses = [[list(row) for row in camera.matrix_world] for camera in cameras]
-    with open(os.path.join(job["out"], "cameras.json.partial"), "w") as out:
+    with open(os.path.join(job["out"], "cameras.json.partial"), "w", encoding="utf-8") as out:
         fields = [camera["field_of_view"] for camera in job["cameras"]]
         json.dump({"width": job["width"], "height": job["height"], "field_of_view": fields, "poses": poses}, out)
     os.replace(os.path.join(job["out"], "cameras.json.partial"), os.path.join(job["out"], "cameras.json"))
@@ -136,7 +136,7 @@ def main(path):
             passes.write_npy(os.path.join(folder, "0000.npy"), (panorama * exposure).astype(np.float32))
             for sun in suns:
                 sun["irradiance"] = [value * exposure for value in sun["irradiance"]]
-            with open(os.path.join(folder, "suns.json"), "w") as out:
+            with open(os.path.join(folder, "suns.json"), "w", encoding="utf-8") as out:
                 json.dump(suns, out, indent=1)
             _done(folder, 0, 0.0)
             passes.configure(job["width"], job["height"], job["samples"], job.get("seed", 0))
