@@ -12,11 +12,11 @@ from tiny_project import write_project
 AS_WINDOWS = '''
 """Runs at the start of each Python: removes what Windows lacks, and refuses what Windows refuses."""
 
-import os, shutil, signal, sys, tempfile, warnings
+import contextlib, os, shutil, signal, sys, tempfile, warnings
 
 for name in ("resource", "fcntl", "pwd", "grp", "termios", "tty", "pty", "syslog", "readline"):
     sys.modules[name] = None  # import raises ModuleNotFoundError
-for name in ("fork", "forkpty", "killpg", "getpgid", "setsid", "getuid", "geteuid", "getgid", "uname", "sysconf",
+for name in ("fork", "forkpty", "killpg", "getpgid", "setsid", "getuid", "geteuid", "getgid", "sysconf",
              "sched_getaffinity", "getloadavg", "wait3", "mkfifo", "chown", "fchmod", "O_DIRECTORY", "O_NOFOLLOW"):
     delattr(os, name)
 for name in ("SIGKILL", "SIGHUP", "SIGUSR1", "SIGALRM", "SIGCHLD", "SIGPIPE", "setitimer", "pthread_kill"):
@@ -38,7 +38,10 @@ def rename_to_new(source, target, **options):
 
 def in_use(path):
     """Return whether this process has a file open or mapped that is `path` or lies below it."""
-    opened = [os.path.realpath(f"/proc/self/fd/{number}") for number in os.listdir("/proc/self/fd")]
+    opened = []
+    for number in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(FileNotFoundError):  # closed by another thread
+            opened.append(os.readlink(f"/proc/self/fd/{number}"))
     with open("/proc/self/maps", encoding="utf-8") as maps:
         opened += [line[line.index("/"):].rstrip() for line in maps if "/" in line]
     path = os.path.realpath(path)
@@ -46,7 +49,8 @@ def in_use(path):
 
 
 def refuse(event, arguments):
-    if event == "open" and isinstance(arguments[0], (str, bytes, os.PathLike)) and os.path.isdir(arguments[0]):
+    # os.open gives no mode; open() refuses folders on every system, but tempfile names one to it
+    if event == "open" and arguments[1] is None and os.path.isdir(arguments[0]):
         raise PermissionError(13, "Permission denied", str(arguments[0]))
     if event in ("os.rename", "os.remove", "os.rmdir"):
         for path in arguments[: 2 if event == "os.rename" else 1]:

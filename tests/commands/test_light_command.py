@@ -11,11 +11,13 @@ import torch
 from shapes import ring, sunlit_scene
 from torch import Tensor
 
+import splatgraft as sg
 from splatgraft.cli import main
 from splatgraft.core.directions import even_directions
 from splatgraft.core.similarity import Similarity
 from splatgraft.formats import write_cameras, write_gaussians
-from splatgraft.relighting.light.light import light_from_json
+from splatgraft.relighting.light.environment import EnvironmentLight
+from splatgraft.relighting.light.light import Light, LightSource, light_from_json
 
 SUN = torch.nn.functional.normalize(torch.tensor([-0.39, 0.67, 0.8]), dim=0)
 STRENGTH = 3.0
@@ -97,6 +99,44 @@ def test_the_map_shows_the_scene_s_own_pixels_below_its_horizon_and_no_lamp(sunl
     assert lit_by_lamps(sunlit / "light.json", SUN[None]).mean() > 3
 
 
+def test_the_map_alone_lights_a_sphere_as_map_and_lamps(sunlit: Path, tmp_path: Path):
+    scene, cameras = sg.load(sunlit / "target.ply"), sg.read_cameras(sunlit / "transforms.json")
+    at = (CAPTURE_FROM_WORLD @ torch.tensor([0.0, 0.0, 0.3])).tolist()
+    found = sg.light_at(scene, cameras, at, radius=0.3, height=128)
+    # the same as the command's files: 8 bits of mantissa, six decimals
+    beside = read_hdr(sunlit / "light.hdr")
+    assert torch.allclose(found.radiance, beside, rtol=1 / 256, atol=float(beside.max()) / 256)
+    assert float(found.map_from_capture @ CAPTURE_FROM_WORLD @ SUN @ SUN) == pytest.approx(1, abs=1e-3)
+    sg.save_hdr(tmp_path / "alone.hdr", found.with_lamps())
+    normals = even_directions(2000)
+    alone = lit_by_map(read_hdr(tmp_path / "alone.hdr"), normals)
+    both = lit_by_map(beside, normals) + lit_by_lamps(sunlit / "light.json", normals)
+    # a disc of radius r adds sin(r) / 4 of the lamp at its own horizon, which is 1% for 2 degrees; 8 bits are 0.4%
+    assert float((alone / both - 1).abs().max()) < 0.03
+    assert not torch.allclose(lit_by_map(beside, normals) / both, torch.tensor(1.0), atol=0.3)
+    with pytest.raises(ValueError, match=r"light\.png: expected a name that ends in \.hdr"):
+        sg.save_hdr(tmp_path / "light.png", found.radiance)
+
+
+@pytest.mark.parametrize("height", [16, 64, 512])
+@pytest.mark.parametrize("towards", [(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.6, 0.48, 0.64), (0.0, -0.8, -0.6)])
+@pytest.mark.parametrize(("radius_deg", "strength"), [(0.27, 1.0), (0.27, 100.0), (5.0, 1.0), (90.0, 1.0)])
+def test_a_lamp_in_the_map_has_its_energy_at_every_size_and_place(
+    height: int, towards: tuple[float, float, float], radius_deg: float, strength: float
+):
+    source = LightSource(towards, (0.2 * strength, strength, 0.5 * strength), radius_deg)
+    found = EnvironmentLight(Light((source,), torch.zeros(9, 3)), torch.zeros(height, 2 * height, 3), torch.eye(3))
+    radiance = found.with_lamps()
+    # rounding of float32 in a sum of at most 524,288 pixels
+    assert lit_by_map(radiance, torch.tensor([towards]))[0].tolist() == pytest.approx(source.irradiance, rel=1e-3)
+    # radiance of a disc one degree wide, whose edge cuts pixels of 0.35 degrees; half floats end at 65,504
+    assert float(radiance.max()) < min(65_504, 1.1 * strength / (math.pi * math.radians(0.5) ** 2))
+    # no wider than the lamp, the disc that half floats need (1.3 degrees) or a pixel, and the soft edge of a pixel
+    widest = max(radius_deg, 1.4, 90 / height) + 90 / height
+    is_lit, cosine = radiance[..., 1] > 0, pixels(height)[0] @ torch.tensor(towards)
+    assert float(cosine[is_lit].min()) > math.cos(math.radians(widest)) - 1e-6
+
+
 def test_the_lamps_can_be_given_back_in_the_axes_of_the_capture(sunlit: Path):
     text = (sunlit / "light.json").read_text()
     back = light_from_json(text)
@@ -131,6 +171,15 @@ def test_at_a_project_s_object_it_is_the_light_that_relight_finds(copy_project: 
     assert main(["light", str(file), "--out", str(out), "--height", "16"]) == 0
     # 8 bits of mantissa
     assert torch.allclose(read_hdr(out), torch.tensor(0.5), rtol=1 / 256)
+    # with the lamps in the map there is one file
+    sun = {"direction": [0.0, 0.6, 0.8], "irradiance": [3.0, 2.0, 1.0], "angular_radius_deg": 2.0}
+    (project / "given.json").write_text(json.dumps(light | {"sources": [sun], "ambient_sh": ambient}))
+    alone = project / "alone.hdr"
+    assert main(["light", str(file), "--out", str(alone), "--lamps", "map", "--frame", "capture"]) == 0
+    assert not alone.with_suffix(".json").exists()
+    lit = lit_by_map(read_hdr(alone), torch.tensor([sun["direction"]]))[0]
+    # 0.5 of an even sky gives half of pi; 8 bits of mantissa
+    assert lit.tolist() == pytest.approx([0.5 * math.pi + v for v in sun["irradiance"]], rel=0.01)
     capsys.readouterr()
     for wrong, line in (
         (["--out", "light.png"], "--out: expected a file that ends in .hdr, found light.png"),
