@@ -1,14 +1,16 @@
 """Atomic files: replaced when complete, unchanged after an error or a kill."""
 
 import errno
+import ntpath
 import os
+from pathlib import PureWindowsPath
 from types import SimpleNamespace
 
 import pytest
 from killing import Killed, killed_at_write
 
 from splatgraft.runtime import files
-from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.files import atomic_write, relative_name
 
 
 def test_failure_keeps_what_was_there_and_what_a_kill_left_is_cleared(tmp_path):
@@ -47,26 +49,18 @@ def test_where_nothing_can_be_written(tmp_path):
 
 
 def test_a_folder_is_replaced_on_windows(tmp_path, monkeypatch):
-    """Windows opens no folders, and flushes only files that are open for writing."""
-    opened: dict[int, int] = {}
-
-    def open_as_windows(path, flags):
-        if os.path.isdir(path):
-            raise PermissionError(errno.EACCES, "Permission denied", str(path))
-        descriptor = os.open(path, flags)
-        opened[descriptor] = flags
-        return descriptor
+    """Windows cannot exchange two folders, and flushes only files that are open for writing."""
+    fcntl = pytest.importorskip("fcntl")
 
     def flush_as_windows(descriptor):
-        if not opened[descriptor] & os.O_RDWR:
+        if not fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_RDWR:
             raise OSError(errno.EBADF, "Bad file descriptor")
         flushed.append(descriptor)
 
     flushed: list[int] = []
     with monkeypatch.context() as windows:
         windows.setattr(files, "sys", SimpleNamespace(platform="win32"))
-        own = {"open": open_as_windows, "fsync": flush_as_windows}
-        windows.setattr(files, "os", SimpleNamespace(**{**vars(os), **own}))
+        windows.setattr(files, "os", SimpleNamespace(**{**vars(os), "fsync": flush_as_windows}))
         for text in ("first", "second"):
             with files.atomic_folder(tmp_path / "result") as folder:
                 (folder / "inner").mkdir()
@@ -74,3 +68,12 @@ def test_a_folder_is_replaced_on_windows(tmp_path, monkeypatch):
     assert (tmp_path / "result" / "inner" / "a.txt").read_text() == "second"
     assert len(flushed) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["result"]
+
+
+def test_a_relative_name_has_forward_slashes_and_is_absolute_on_another_drive(tmp_path, monkeypatch):
+    assert relative_name(tmp_path / "photos" / "vase", tmp_path / "garden") == "../photos/vase"
+    with monkeypatch.context() as windows:
+        windows.setattr(files, "os", SimpleNamespace(path=ntpath, sep=ntpath.sep))
+        photos = PureWindowsPath("C:/photos/vase")
+        assert relative_name(photos, PureWindowsPath("C:/projects/garden")) == "../../photos/vase"
+        assert relative_name(photos, PureWindowsPath("D:/garden")) == "C:/photos/vase"

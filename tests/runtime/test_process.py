@@ -6,9 +6,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from splatgraft.runtime import process
 from splatgraft.runtime.process import interruption_held, last_line, open_page, run_logged
 
 
@@ -107,6 +109,21 @@ def test_a_page_is_opened_by_the_desktop_alone(tmp_path: Path, monkeypatch: pyte
     opener.unlink()
     monkeypatch.setenv("PATH", str(tmp_path))
     assert not open_page(tmp_path / "index.html")
+
+
+def test_a_page_is_opened_by_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python has `os.startfile` on Windows alone; here the call is checked, not what it opens."""
+
+    def refuse(page: str) -> None:
+        raise OSError("no program for pages")
+
+    opened: list[str] = []
+    monkeypatch.setattr(process, "sys", SimpleNamespace(platform="win32"))
+    monkeypatch.setattr(process.os, "startfile", opened.append, raising=False)
+    assert open_page("index.html")
+    assert opened == ["index.html"]
+    monkeypatch.setattr(process.os, "startfile", refuse)
+    assert not open_page("index.html")
 
 
 PROGRAM = """
