@@ -8,6 +8,7 @@ from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.step import Positional
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
+from splatgraft.segmentation import SolidifyOptions
 from splatgraft.workflow.run import run_steps
 
 CAPTURES_FOLDER = "captures"
@@ -28,7 +29,7 @@ budget = {budget}
 
 [source.reconstruct]
 iterations = {source_iterations}
-
+{segment}
 [compose]
 scale = 1.0  # both captures are in metres
 
@@ -48,7 +49,7 @@ class Demo:
     width: int = 1280
     """Width of the report's pictures, pixels."""
     iterations: int = 2000
-    """Training steps of the table; the bananas take half, because the object is fitted again."""
+    """Training steps of the table; the bananas take half, because the object is fitted again, in at most as many."""
     budget: int = 30_000
     """Maximum number of Gaussians of each scene."""
 
@@ -56,7 +57,8 @@ class Demo:
         """Write the project and run it; finished steps of an earlier, killed demo are kept."""
         project = self.folder / PROJECT_FILE
         lengths = {"iterations": self.iterations, "source_iterations": max(1, self.iterations // 2)}
-        text = _PROJECT.format(**lengths, budget=self.budget, width=self.width)
+        segment = f"\n[segment]\nsolidify = {self.iterations}\n" if self.iterations < SolidifyOptions.iterations else ""
+        text = _PROJECT.format(**lengths, budget=self.budget, width=self.width, segment=segment)
         if project.exists() and project.read_text(encoding="utf-8") != text:
             raise ValueError(f"{project}: expected no project, or a demo with the same options; found another")
         copy_captures(self.folder / CAPTURES_FOLDER)
