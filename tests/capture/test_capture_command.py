@@ -274,6 +274,11 @@ def test_a_zip_whose_photos_are_damaged_inside_leaves_nothing(tmp_path: Path) ->
         archive.writestr("0.png", bytes(1000))
     with pytest.raises(ValueError, match=r"c\.zip: expected a \.zip of photos, found one that is not deflated"):
         unpack_photos(path, tmp_path / "photos")
+    # a drive of Windows
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("C:/0.png", bytes(1000))
+    with pytest.raises(ValueError, match=r"found one that writes outside of its folder, to C:/0\.png"):
+        unpack_photos(path, tmp_path / "photos")
     assert [entry.name for entry in tmp_path.iterdir()] == ["c.zip"]
 
 

@@ -96,8 +96,8 @@ def extract_frames(
         for index, frame in enumerate(_frames(capture, progress, "writing frames")):
             if index in wanted:
                 paths.append(folder / f"frame_{index:06d}.png")
-                if not cv2.imwrite(str(paths[-1]), frame):
-                    raise ValueError(f"{paths[-1]}: expected to write a frame, found that OpenCV could not")
+                # on Windows cv2.imwrite knows no path with letters of other countries
+                paths[-1].write_bytes(cv2.imencode(".png", frame)[1].tobytes())
     return paths, tuple(notes)
 
 

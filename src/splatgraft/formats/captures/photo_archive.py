@@ -5,7 +5,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from splatgraft.core.images import IMAGE_SUFFIXES
 
@@ -67,7 +67,7 @@ def _opened(archive: Path) -> Iterator[tuple[zipfile.ZipFile, list[tuple[zipfile
             members = [(one, PurePosixPath(one.filename)) for one in opened.infolist()]
             members = [(one, name) for one, name in members if not one.is_dir() and _is_picture(name)]
             for _, name in members:
-                if name.is_absolute() or ".." in name.parts:
+                if name.is_absolute() or PureWindowsPath(name).drive or ".." in name.parts:
                     raise ValueError(f"{expected} one that writes outside of its folder, to {name}")
             size = sum(one.file_size for one, _ in members)
             if len(members) > _MAX_FILES or size > max(_SMALL, min(_MAX_BYTES, _MAX_RATIO * archive.stat().st_size)):
