@@ -226,7 +226,7 @@ def read_orida(root: Path) -> list[Photograph]:
     path, found = root / INDEX_FILE, []
     if not path.is_file():
         raise ValueError(f"{path}: expected a table with the columns {', '.join(COLUMNS)}, found no file")
-    with path.open(newline="") as stream:
+    with path.open(newline="", encoding="utf-8") as stream:
         reader = csv.DictReader(stream)
         if missing := [name for name in COLUMNS if name not in (reader.fieldnames or ())]:
             raise ValueError(f"{path}: expected the columns {', '.join(COLUMNS)}, found no {missing[0]}")

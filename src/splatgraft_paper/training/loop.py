@@ -395,7 +395,7 @@ class _Loop:
                 continue  # a killed run may leave an incomplete line
         with atomic_write(path) as whole:
             whole.write("".join(f"{line}\n" for line in remaining).encode())
-        with path.open("a") as stream:
+        with path.open("a", encoding="utf-8") as stream:
             yield stream
 
     def _job(self) -> dict[str, Any]:
