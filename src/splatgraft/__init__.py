@@ -66,6 +66,7 @@ if TYPE_CHECKING:
         solidify_object,
     )
     from splatgraft.workflow.run import run_project, stale_steps
+    from splatgraft.workflow.transfer import Transfer, transfer
 
 __version__ = "0.1.0"
 
@@ -98,6 +99,7 @@ __all__ = [
     "Similarity",
     "SolidifyOptions",
     "SourceScene",
+    "Transfer",
     "Truth",
     "compose",
     "consolidate",
@@ -126,6 +128,7 @@ __all__ = [
     "select_object",
     "solidify_object",
     "stale_steps",
+    "transfer",
     "true_views",
 ]
 
