@@ -47,7 +47,7 @@ def similarity(truth: np.ndarray, found: np.ndarray) -> Similarity:
 def posed_panoramas(folder: Path, work: Path) -> PosedImages:
     """Pose the panoramas, print the errors, and return their views in the true frame."""
     posed, report = pose_photos(find_photos(folder / "panoramas"), work, scratch=work / "scratch")
-    truth = np.array(json.loads((folder / "truth.json").read_text())["panoramas"]) @ OPENCV_FROM_OPENGL
+    truth = np.array(json.loads((folder / "truth.json").read_text("utf-8"))["panoramas"]) @ OPENCV_FROM_OPENGL
     stems = [name.rsplit("_", 1)[0] for name in posed.cameras.names[::8]]
     truth = truth[[int(stem) for stem in stems]]
     move = similarity(truth[:, :3, 3], posed.cameras.centers[::8].double().numpy())
@@ -82,7 +82,7 @@ def measure(folder: Path) -> None:
             cameras=joined(photos.cameras, views.cameras),
         )
         for title, capture in (("photos", alone), ("photos and panoramas", both)):
-            report_light(f"{folder.name}, {title}", capture, json.loads((folder / "truth.json").read_text()))
+            report_light(f"{folder.name}, {title}", capture, json.loads((folder / "truth.json").read_text("utf-8")))
 
 
 def report_light(title: str, capture: PosedImages, truth: dict[str, list[float]]) -> None:

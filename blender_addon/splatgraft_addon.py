@@ -46,7 +46,7 @@ class Job:
         """Run `commands`, lists of words, one after another until one fails; after the last one call `done`."""
         self.commands, self.log, self.done, self.process = list(commands), log, done, None
         log.parent.mkdir(parents=True, exist_ok=True)
-        log.write_text("")
+        log.write_text("", "utf-8")
         Job.running = self
         bpy.app.timers.register(Job.poll, first_interval=0.0)
 
@@ -70,7 +70,7 @@ class Job:
     def _step(self, state):
         if self.process is not None:
             code = self.process.poll()
-            said = [line.strip() for line in self.log.read_text(errors="replace").splitlines() if line.strip()]
+            said = [line.strip() for line in self.log.read_text("utf-8", errors="replace").splitlines() if line.strip()]
             state.status = said[-1] if said else "begins"
             if code is None:
                 return True
@@ -81,7 +81,7 @@ class Job:
             with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
                 state.status = self.done()
             return False
-        with self.log.open("a") as log:
+        with self.log.open("a", encoding="utf-8") as log:
             self.process = subprocess.Popen(self.commands.pop(0), stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         return True
 
@@ -234,7 +234,7 @@ def upright_from_capture(cameras):
     """Compute the smallest rotation (4x4) from a capture's up, the mean of its cameras', to +z; the default is -y."""
     up = Vector((0.0, -1.0, 0.0))
     if cameras.is_file():
-        frames = json.loads(cameras.read_text())["frames"]
+        frames = json.loads(cameras.read_text("utf-8"))["frames"]
         up = Vector(np.mean([np.asarray(frame["transform_matrix"])[:3, 1] for frame in frames], 0))
     return up.rotation_difference(Vector((0.0, 0.0, 1.0))).to_matrix().to_4x4()
 
@@ -329,7 +329,7 @@ def write_placement(paths):
     scale, rotation, translation = target_from_object()
     named = os.path.relpath(paths.object, paths.folder)
     placed = {"object": named, "scale": scale, "rotation": rotation.tolist(), "translation": translation.tolist()}
-    paths.placement.write_text(json.dumps({"objects": [placed]}, indent=1))
+    paths.placement.write_text(json.dumps({"objects": [placed]}, indent=1), "utf-8")
 
 
 def show_result(paths):
@@ -342,7 +342,7 @@ def show_result(paths):
         for part in ("target", "object"):
             find(part).hide_viewport = find(part).hide_render = True
     place = root.matrix_world.inverted() @ find("box").matrix_world.translation
-    lamps = json.loads(paths.lamps.read_text())["sources"]
+    lamps = json.loads(paths.lamps.read_text("utf-8"))["sources"]
     for lamp in lamps:
         _add_lamp(lamp, root, place)
     _set_world(paths.map, root)
