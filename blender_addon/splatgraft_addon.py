@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blender add-on: insert an object from a Gaussian splat capture into another one, lit by its new place.
+"""Blender add-on: show a Gaussian splat capture with its light, or insert an object of another one, lit by its place.
 
 It calls the command line (`splatgraft capture`, `adopt`, `relight`, `light`) in the background and imports the files
 that it writes. Everything of the target has one empty as its parent. The local axes of the empty are those of the
@@ -46,7 +46,7 @@ class Job:
         """Run `commands`, lists of words, one after another until one fails; after the last one call `done`."""
         self.commands, self.log, self.done, self.process = list(commands), log, done, None
         log.parent.mkdir(parents=True, exist_ok=True)
-        log.write_text("")
+        log.write_text("", "utf-8")
         Job.running = self
         bpy.app.timers.register(Job.poll, first_interval=0.0)
 
@@ -70,7 +70,7 @@ class Job:
     def _step(self, state):
         if self.process is not None:
             code = self.process.poll()
-            said = [line.strip() for line in self.log.read_text(errors="replace").splitlines() if line.strip()]
+            said = [line.strip() for line in self.log.read_text("utf-8", errors="replace").splitlines() if line.strip()]
             state.status = said[-1] if said else "begins"
             if code is None:
                 return True
@@ -81,7 +81,7 @@ class Job:
             with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
                 state.status = self.done()
             return False
-        with self.log.open("a") as log:
+        with self.log.open("a", encoding="utf-8") as log:
             self.process = subprocess.Popen(self.commands.pop(0), stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         return True
 
@@ -99,7 +99,9 @@ class Settings(bpy.types.PropertyGroup):
         name="Command", subtype="FILE_PATH", default="splatgraft", description="splatgraft's program"
     )
     source: StringProperty(
-        name="Object", subtype="FILE_PATH", description="A splatgraft project, for its object, or an object's .ply"
+        name="Object",
+        subtype="FILE_PATH",
+        description="A splatgraft project, for its object, or an object's .ply; empty for the target's light alone",
     )
     target: StringProperty(
         name="Target", subtype="FILE_PATH", description="A trained scene (.ply, .spz, .glb, ...), or a project's folder"
@@ -122,10 +124,11 @@ class Paths:
             raise ValueError("Results: expected a folder, or a .blend that was saved, found neither")
         self.folder = Path(bpy.path.abspath(settings.folder)).resolve()
         source, target = (Path(bpy.path.abspath(path)) for path in (settings.source, settings.target))
+        self.has_object = bool(settings.source)
         self.object = source / "object" / "object.ply" if source.is_dir() else source
-        if not self.object.is_file() or self.object.suffix != ".ply":
+        if self.has_object and (not self.object.is_file() or self.object.suffix != ".ply"):
             raise ValueError(f"Object: expected a project with object/object.ply, or a .ply, found {settings.source!r}")
-        self.surroundings = self.object.with_name("surroundings.ply")
+        self.surroundings = self.object.with_name("surroundings.ply") if self.has_object else self.object
         self.object_cameras = self.object.parent.parent / "source" / "capture" / "transforms.json"
         self.knows_source = self.surroundings.is_file() and self.object_cameras.is_file()
         self.given_target = target / "target" / "scene" / "scene.ply" if target.is_dir() else target
@@ -152,13 +155,18 @@ class Paths:
         ]
 
     def relighting(self):
-        """Return the commands that relight the object and write the light."""
-        common = ["--placement", str(self.placement), "--cameras", str(self.cameras)]
-        relight = [self.command, "relight", "--target", str(self.target), *common, "--out", str(self.relit.parent)]
+        """Return the commands that relight the object at its box and write the light there."""
+        light = [self.command, "light", str(self.target), "--out", str(self.map), "--frame", "capture"]
+        light += ["--cameras", str(self.cameras)]
+        if not self.has_object:
+            place, radius = place_of_ball()
+            return [[*light, "--radius", str(radius), "--at", *map(str, place)]]
+        write_placement(self)
+        relight = [self.command, "relight", "--target", str(self.target), "--cameras", str(self.cameras)]
+        relight += ["--placement", str(self.placement), "--out", str(self.relit.parent)]
         if self.knows_source:
             relight += ["--surroundings", str(self.surroundings), "--object-cameras", str(self.object_cameras)]
-        light = [self.command, "light", str(self.target), *common, "--out", str(self.map), "--frame", "capture"]
-        return [relight, light]
+        return [relight, [*light, "--placement", str(self.placement)]]
 
 
 def find(part):
@@ -226,7 +234,7 @@ def upright_from_capture(cameras):
     """Compute the smallest rotation (4x4) from a capture's up, the mean of its cameras', to +z; the default is -y."""
     up = Vector((0.0, -1.0, 0.0))
     if cameras.is_file():
-        frames = json.loads(cameras.read_text())["frames"]
+        frames = json.loads(cameras.read_text("utf-8"))["frames"]
         up = Vector(np.mean([np.asarray(frame["transform_matrix"])[:3, 1] for frame in frames], 0))
     return up.rotation_difference(Vector((0.0, 0.0, 1.0))).to_matrix().to_4x4()
 
@@ -245,6 +253,34 @@ def show_parts(paths):
     root.matrix_world = upright_from_capture(paths.cameras)
     target, said = import_splats(paths.target, "target")
     target.parent = root
+    upright = _positions(target) @ np.array(root.matrix_world.to_3x3()).T
+    box = _object_in_box(paths) if paths.has_object else _place_marker(upright)
+    box.matrix_world = Matrix.Translation(Vector(np.median(upright, 0)))
+    bpy.context.view_layer.update()
+    box.parent, box.matrix_parent_inverse = root, root.matrix_world.inverted()
+    bpy.context.view_layer.objects.active = box
+    if not paths.has_object:
+        return f"{said}; move the ball to where a mesh will stand, then Relight"
+    return f"{said}; move, turn and scale the box (captures have no common unit), then Relight"
+
+
+def _new_box(name, mesh):
+    box = bpy.data.objects.new(name, mesh)
+    box["splatgraft"] = "box"
+    bpy.context.scene.collection.objects.link(box)
+    return box
+
+
+def _place_marker(points):
+    """Make a ball that marks a place, a twentieth as wide as the middle half of the points."""
+    marker = _new_box("splatgraft place: move me", None)
+    marker.empty_display_type = "SPHERE"
+    marker.empty_display_size = float(np.ptp(np.percentile(points, [25, 75], axis=0), axis=0).max()) / 40
+    return marker
+
+
+def _object_in_box(paths):
+    """Import the object, upright, as the child of a box around it."""
     thing, _ = import_splats(paths.object, "object")
     low, high = np.percentile(_positions(thing), [_STRAY, 100 - _STRAY], axis=0)
     # the box surrounds the upright points; its frame is the object's, with the origin in the middle
@@ -255,16 +291,19 @@ def show_parts(paths):
     mesh = bpy.data.meshes.new("splatgraft box")
     corners = [[(low, high)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)]
     mesh.from_pydata(corners, [(i, i | 1 << axis) for i in range(8) for axis in range(3) if not i >> axis & 1], [])
-    box = bpy.data.objects.new("splatgraft object: move me", mesh)
-    box["splatgraft"] = "box"
-    bpy.context.scene.collection.objects.link(box)
+    box = _new_box("splatgraft object: move me", mesh)
     thing.parent, thing.matrix_local = box, inner
-    start = np.median(_positions(target) @ np.array(root.matrix_world.to_3x3()).T, 0)
-    box.matrix_world = Matrix.Translation(Vector(start))
+    return box
+
+
+def place_of_ball():
+    """Return the middle and the radius of the ball in the target's capture."""
+    root, box = find("root"), find("box")
+    if root is None or box is None or box.type != "EMPTY":
+        raise ValueError("Relight: expected a target without an object in the scene, found none; press Load first")
     bpy.context.view_layer.update()
-    box.parent, box.matrix_parent_inverse = root, root.matrix_world.inverted()
-    bpy.context.view_layer.objects.active = box
-    return f"{said}; move, turn and scale the box (captures have no common unit), then Relight"
+    matrix = root.matrix_world.inverted() @ box.matrix_world
+    return tuple(matrix.translation), box.empty_display_size * matrix.median_scale
 
 
 def target_from_object():
@@ -290,19 +329,20 @@ def write_placement(paths):
     scale, rotation, translation = target_from_object()
     named = os.path.relpath(paths.object, paths.folder)
     placed = {"object": named, "scale": scale, "rotation": rotation.tolist(), "translation": translation.tolist()}
-    paths.placement.write_text(json.dumps({"objects": [placed]}, indent=1))
+    paths.placement.write_text(json.dumps({"objects": [placed]}, indent=1), "utf-8")
 
 
 def show_result(paths):
     """Import the relit scene in place of its parts, the lamps and the world; gives a message for the panel."""
     _remove("relit", "lamp")
-    root = find("root")
-    relit, said = import_splats(paths.relit, "relit")
-    relit.parent = root
-    for part in ("target", "object"):
-        find(part).hide_viewport = find(part).hide_render = True
+    root, said = find("root"), "the light at the ball"
+    if paths.has_object:
+        relit, said = import_splats(paths.relit, "relit")
+        relit.parent = root
+        for part in ("target", "object"):
+            find(part).hide_viewport = find(part).hide_render = True
     place = root.matrix_world.inverted() @ find("box").matrix_world.translation
-    lamps = json.loads(paths.lamps.read_text())["sources"]
+    lamps = json.loads(paths.lamps.read_text("utf-8"))["sources"]
     for lamp in lamps:
         _add_lamp(lamp, root, place)
     _set_world(paths.map, root)
@@ -355,12 +395,12 @@ class SPLATGRAFT_OT_load(bpy.types.Operator):
 
 
 class SPLATGRAFT_OT_relight(bpy.types.Operator):
-    """Give the object the light at the place of its box, and the place the object's shadow"""
+    """Give the object the light at the place of its box, and the place the object's shadow; set lamps and World"""
 
     bl_idname, bl_label = "splatgraft.relight", "Relight"
 
     def execute(self, context):
-        return _begin(self, context, lambda paths: write_placement(paths) or paths.relighting(), show_result)
+        return _begin(self, context, lambda paths: paths.relighting(), show_result)
 
 
 class SPLATGRAFT_OT_stop(bpy.types.Operator):

@@ -69,6 +69,7 @@ if TYPE_CHECKING:
         solidify_object,
     )
     from splatgraft.workflow.run import run_project, stale_steps
+    from splatgraft.workflow.transfer import Transfer, transfer
 
 __version__ = "0.1.0"
 
@@ -102,6 +103,7 @@ __all__ = [
     "Similarity",
     "SolidifyOptions",
     "SourceScene",
+    "Transfer",
     "Truth",
     "compose",
     "consolidate",
@@ -132,6 +134,7 @@ __all__ = [
     "select_object",
     "solidify_object",
     "stale_steps",
+    "transfer",
     "true_views",
 ]
 

@@ -25,6 +25,7 @@ def main(addon_file, command, source, target, folder, out):
     settings = bpy.context.scene.splatgraft
     settings.command, settings.folder, settings.source, settings.target = command, folder, source, folder
     found["refused"] = refused("load")
+    found |= target_alone(addon, settings, target)
     # an object and a scene without captures
     settings.source = str(Path(source) / "object" / "object.ply")
     settings.target, settings.folder = str(Path(folder) / "bare.ply"), str(Path(folder) / "bare")
@@ -56,7 +57,7 @@ def main(addon_file, command, source, target, folder, out):
     found["world"] = render_world()
     found["level"] = [render_level(addon, root, away) for away in (None, 3.0)]
     found["blocks"] = addon.find("relit").visible_shadow or addon.find("relit").visible_diffuse
-    found["colors"] = len(addon.find("relit").data.color_attributes)
+    found["attributes"] = [one.name for one in addon.find("relit").data.attributes]
     # a failed command's line is shown
     Path(folder, "light.json").rename(Path(folder, "lamps.json"))
     settings.source = str(Path(out).with_suffix(".ply"))
@@ -68,6 +69,19 @@ def main(addon_file, command, source, target, folder, out):
     bpy.ops.import_scene.gltf(filepath=str(Path(folder) / "bare.glb"))
     found["glb"] = world_points(bpy.context.object)
     Path(out).write_text(json.dumps(found))
+
+
+def target_alone(addon, settings, target):
+    """Load a target without an object, and light a place in it."""
+    settings.source, settings.target = "", target
+    run(addon, "load")
+    loaded = [settings.status, addon.find("object") is None, addon.find("target").type]
+    addon.find("box").matrix_world = Matrix.Translation((-0.2, 0.1, 0.3))
+    run(addon, "relight")
+    bpy.context.view_layer.update()
+    lamps = [described(one) for one in bpy.data.objects if one.get("splatgraft") == "lamp"]
+    shown = [settings.status, addon.find("target").hide_render, bpy.context.scene.world.name]
+    return {"loaded alone": loaded, "lamps alone": lamps, "shown alone": shown}
 
 
 def refused(name):
@@ -91,8 +105,9 @@ def finish(addon):
 
 def world_points(thing):
     bpy.context.view_layer.update()
-    points = np.zeros((len(thing.data.vertices), 3), np.float32)
-    thing.data.vertices.foreach_get("co", points.ravel())
+    positions = thing.data.attributes["position"].data  # of a mesh's vertices, or of a point cloud
+    points = np.zeros((len(positions), 3), np.float32)
+    positions.foreach_get("vector", points.ravel())
     matrix = np.array(thing.matrix_world)
     return (points @ matrix[:3, :3].T + matrix[:3, 3]).tolist()
 
@@ -134,7 +149,7 @@ def render_world():
     """Render a panorama of the world alone: top +z, middle +x, to the right -y."""
     camera = new_camera((0, 0, 0), (math.pi / 2, 0, -math.pi / 2))
     camera.data.type, camera.data.panorama_type = "PANO", "EQUIRECTANGULAR"
-    things = [one for one in bpy.data.objects if one.type in ("MESH", "LIGHT") and not one.hide_render]
+    things = [one for one in bpy.data.objects if one.type in ("MESH", "POINTCLOUD", "LIGHT") and not one.hide_render]
     for one in things:
         one.hide_render = True
     panorama = render(camera, 64, 32, 16)

@@ -49,6 +49,35 @@ def turned_between_series(folder: Path, counts: tuple[int, int], step_deg: float
     return poses
 
 
+def panoramas(folder: Path, count: int, width: int) -> np.ndarray:
+    """Write `count` panoramas from a path through a textured room, each turned otherwise, with a person below.
+
+    The person is a disc of one texture below 50 degrees under the horizon, which moves and turns with the camera.
+
+    Returns:
+        World from panorama (count, 4, 4), +z in the middle of the picture and +y down, in a world with z up.
+    """
+    folder.mkdir(parents=True)
+    generator = np.random.default_rng(0)
+    walls, person = [texture(generator, 1024) for _ in range(6)], texture(generator, 512)
+    v, u = np.mgrid[0 : width // 2, 0:width] + 0.5
+    yaw, pitch = 2 * np.pi * (u / width - 0.5), np.pi * (0.5 - 2 * v / width)
+    rays = np.stack([np.cos(pitch) * np.sin(yaw), -np.sin(pitch), np.cos(pitch) * np.cos(yaw)], -1)
+    poses = []
+    for i in range(count):
+        turn = 1.3 * i
+        pose = _about_z(turn)
+        pose[:3, :3] = pose[:3, :3] @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+        pose[:3, 3] = 1.5 * np.cos(2 * np.pi * i / count), 1.2 * np.sin(2 * np.pi * i / count), 0.2 * np.sin(5 * i)
+        color, _ = _box(pose, walls, half=3.0, inside=True, rays=rays)
+        below = pitch < np.deg2rad(-50)
+        a, b = (100 * (1 + rays[below][:, [0, 2]] / rays[below][:, 1:2])).astype(int).T
+        color[below] = person[b, a]
+        Image.fromarray((color * 255).round().astype(np.uint8)).save(folder / f"{i:02d}.jpg", quality=95)
+        poses.append(pose)
+    return np.stack(poses)
+
+
 def texture(generator: np.random.Generator, side: int) -> np.ndarray:
     layers = [generator.random((8 * 2**i, 8 * 2**i, 3)).astype(np.float32) for i in range(4)]
     return sum(cv2.resize(layer, (side, side)) / 4 for layer in layers)
@@ -82,12 +111,22 @@ def _about_z(angle: float) -> np.ndarray:
 
 
 def _box(
-    pose: np.ndarray, textures: list[np.ndarray], *, half: float = 0.7, inside: bool = False
+    pose: np.ndarray,
+    textures: list[np.ndarray],
+    *,
+    half: float = 0.7,
+    inside: bool = False,
+    rays: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return colours (h, w, 3) and the rays' intersections with the box from -half to half (slab test)."""
-    width, height = SIZE
-    v, u = np.mgrid[0:height, 0:width] + 0.5
-    rays = np.stack([(u - width / 2) / FOCAL, (v - height / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:3, :3].T
+    """Return colours (h, w, 3) and the rays' intersections with the box from -half to half (slab test).
+
+    `rays` are in the camera's axes; a pinhole's by default.
+    """
+    if rays is None:
+        v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
+        rays = np.stack([(u - SIZE[0] / 2) / FOCAL, (v - SIZE[1] / 2) / FOCAL, np.ones_like(u)], -1)
+    height, width, _ = rays.shape
+    rays = rays @ pose[:3, :3].T
     near, far = np.sort([(sign * half - pose[:3, 3]) / rays for sign in (-1, 1)], axis=0)
     hit = near.max(-1) < far.min(-1)
     depth, through = (far.min(-1), far.argmin(-1)) if inside else (near.max(-1), near.argmax(-1))

@@ -31,6 +31,7 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.image_metrics import psnr
 from splatgraft.core.splitting import split_along
 from splatgraft.exports.export_source import FirstView, first_view
+from splatgraft.exports.notebook import frame_of
 from splatgraft.exports.pages import write_viewer_page
 from splatgraft.folders.export_source import read_export_source
 from splatgraft.formats.scenes.axes import change_axes, rdf_from
@@ -114,6 +115,18 @@ def divided(before: torch.Tensor, after: torch.Tensor, column: int | None = None
     """Return the first picture left of a column, the middle by default, and the second right of it."""
     at = before.shape[1] // 2 if column is None else column
     return torch.cat([before[:, :at], after[:, at:]], 1)
+
+
+def test_the_page_works_in_the_frame_of_a_notebook(browser, page_file, tmp_path):
+    (tmp_path / "notebook.html").write_text(frame_of(page_file, height=SIZE[1]), "utf-8")
+    context = browser.new_context(offline=True)
+    context.set_default_timeout(1000 * HANG_LIMIT)
+    page = context.new_page()
+    page.goto((tmp_path / "notebook.html").as_uri())
+    inside = page.frame_locator("iframe")
+    inside.locator("body[data-state=ready], body[data-state=failed]").wait_for()
+    assert inside.locator("body").get_attribute("data-state") == "ready", inside.locator("#message").inner_text()
+    assert page.locator("iframe").bounding_box()["height"] == SIZE[1]
 
 
 def test_a_story_of_the_page(browser, project, page_file):

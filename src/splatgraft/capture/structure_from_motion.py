@@ -6,7 +6,7 @@ COLMAP runs in a process of its own (colmap_process/). Its model is checked, und
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -16,12 +16,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.capture.colmap_process.job import MAX_ERROR_PX, MIN_TRACK, PHASES, Job
+from splatgraft.capture.panoramas import CUT_BELOW, are_panoramas, cut_views, panorama_from_views
 from splatgraft.capture.photos import camera_groups, working_copies, working_masks, write_undistorted
 from splatgraft.capture.pose_report import Lens, PoseReport, Unposed, find_doubts
-from splatgraft.core.cameras import Cameras
+from splatgraft.core.cameras import Cameras, pinhole
 from splatgraft.core.capture_orientation import estimate_up, quarter_turns
 from splatgraft.core.distortion import Distortion
-from splatgraft.core.images import stored_size
+from splatgraft.core.images import stored_size, write_image
 from splatgraft.core.planes import dominant_level_plane
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.rotations import rotation_to_z
@@ -37,6 +38,7 @@ _ADVICE = (
 _EXHAUSTIVE = 80  # largest number of photos for which all pairs are matched by default
 MIN_POSED_SHARE = 0.5
 """Smallest share of photos with a pose; photos without one are named and left out."""
+_PANORAMA_SIZE = 4  # size of a panorama over that of a photo, because a view has a quarter of its width
 _THOROUGH_COST = 40  # time of a thorough attempt over that of a quick one (more, affine features; guided matching)
 
 
@@ -98,15 +100,19 @@ def pose_photos(
     total = len(PHASES) * len(efforts) + 1
     scratch.mkdir(exist_ok=True)
     progress(0, total, "reading photos")
-    copies = working_copies(photos.paths, scratch / "photos", options.max_size_px)
-    masks = working_masks(photos.masks, copies, scratch / "masks")
+    panoramas = are_panoramas(photos.paths)
+    size_px = options.max_size_px * (_PANORAMA_SIZE if panoramas else 1)
+    copies = working_copies(photos.paths, scratch / "photos", size_px)
+    if panoramas:
+        say(f"{len(copies)} panoramas of 360 degrees: each gives 8 views, without what is below the camera")
+    masks = {} if panoramas else working_masks(photos.masks, copies, scratch / "masks")
     found: list[tuple[dict[str, Any], PoseReport]] = []
     for attempt, effort in enumerate(efforts):
 
         def advance(done: int, message: str, before: int = attempt * len(PHASES)) -> None:
             progress(before + done, total, message)
 
-        model = _run(_job(copies, masks, options, scratch / effort), advance, say)
+        model = _run(_job(copies, masks, options, scratch / effort, panoramas=panoramas), advance, say)
         found.append((model, _report(model, copies)))
         seconds, cpu = (sum(model[name].values()) for name in ("seconds", "cpu_seconds"))
         parts = ", ".join(f"{phase} {took:.0f}" for phase, took in model["seconds"].items())
@@ -131,7 +137,10 @@ def pose_photos(
             f"found {report.registered}; {_ADVICE}; without a pose: {report.reasons}"
         )
     progress(total - 1, total, "undistorting")
-    posed, on_their_side = _posed_images(model, copies[0].parent, masks, workspace)
+    if panoramas:
+        posed, on_their_side = _panorama_views(model, copies[0].parent, workspace), 0
+    else:
+        posed, on_their_side = _posed_images(model, copies[0].parent, masks, workspace)
     if on_their_side:
         say(f"{on_their_side} of {len(posed)} photos lay on their side or upside down and were turned upright")
     progress(total, total, str(report))
@@ -140,7 +149,7 @@ def pose_photos(
 
 def _report(model: Mapping[str, Any], copies: Sequence[Path]) -> PoseReport:
     by_camera: dict[int, list[dict[str, Any]]] = {}
-    for image in model["images"]:
+    for image in filter(lambda image: image["camera"], model["images"]):  # panoramas have no lens
         by_camera.setdefault(image["camera_id"], []).append(image)
     lenses = tuple(
         Lens(
@@ -173,8 +182,18 @@ def _good_points(model: Mapping[str, Any]) -> Float[Tensor, "m 8"]:
     return rows[(rows[:, 7] >= MIN_TRACK) & (rows[:, 6] <= MAX_ERROR_PX)]
 
 
-def _job(copies: Sequence[Path], masks: Mapping[str, Path], options: PoseOptions, scratch: Path) -> Job:
+def _job(
+    copies: Sequence[Path], masks: Mapping[str, Path], options: PoseOptions, scratch: Path, *, panoramas: bool
+) -> Job:
     scratch.mkdir(exist_ok=True)
+    lens = {}
+    if panoramas:
+        width, height = stored_size(copies[0])
+        write_image(
+            below := scratch / "below.png",
+            (torch.arange(height) < CUT_BELOW * height)[:, None].expand(height, width).float(),
+        )
+        lens = {"camera_model": "EQUIRECTANGULAR", "common_mask": str(below.resolve())}
     return Job(
         photos=str(copies[0].parent.resolve()),
         masks=str(next(iter(masks.values())).parent.resolve()) if masks else "",
@@ -184,6 +203,7 @@ def _job(copies: Sequence[Path], masks: Mapping[str, Path], options: PoseOptions
         exhaustive=options.matching == "exhaustive" or (options.matching == "auto" and len(copies) <= _EXHAUSTIVE),
         threads=options.threads,
         seed=options.seed,
+        **lens,
     )
 
 
@@ -236,16 +256,29 @@ def _posed_images(
         sizes=torch.tensor(sizes),
         names=tuple(path.name for path in paths),
     ).turned(turns)
-    rows = _good_points(model)
-    upright_from_sfm = upright(cameras, rows[:, :3])
-    posed = PosedImages(
+    posed = _set_upright(cameras, paths, _good_points(model))
+    return replace(posed, mask_paths=tuple(mask_paths) if masks else ()), int((turns > 0).sum())
+
+
+def _panorama_views(model: Mapping[str, Any], photos: Path, workspace: Path) -> PosedImages:
+    """Return the views of all posed panoramas, upright."""
+    (workspace / "images").mkdir(exist_ok=True)
+    paths = [file for image in model["images"] for file in cut_views(photos / image["name"], workspace / "images")]
+    poses = torch.tensor([[*image["world_from_camera"], [0, 0, 0, 1]] for image in model["images"]])
+    side = stored_size(paths[0])[0]
+    views = (poses[:, None] @ panorama_from_views()).flatten(0, 1)
+    cameras = pinhole(views, side / 2, width=side, height=side)
+    return _set_upright(replace(cameras, names=tuple(path.name for path in paths)), paths, _good_points(model))
+
+
+def _set_upright(cameras: Cameras, paths: Sequence[Path], points: Float[Tensor, "m 8"]) -> PosedImages:
+    upright_from_sfm = upright(cameras, points[:, :3])
+    return PosedImages(
         image_paths=tuple(paths),
         cameras=upright_from_sfm.cameras(cameras),
-        points=upright_from_sfm.points(rows[:, :3]),
-        point_colors=rows[:, 3:6] / 255,
-        mask_paths=tuple(mask_paths) if masks else (),
+        points=upright_from_sfm.points(points[:, :3]),
+        point_colors=points[:, 3:6] / 255,
     )
-    return posed, int((turns > 0).sum())
 
 
 def upright(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Similarity:

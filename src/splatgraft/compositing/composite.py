@@ -10,6 +10,7 @@ from splatgraft.compositing.contact import flatten_contact_layers
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.splitting import split_wide_around
+from splatgraft.runtime.notebook import draw_in_notebook
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,12 @@ class Composite:
     """Objects in the order in which they follow the target in a merged or baked scene."""
     erased: Bool[Tensor, "n"]
     """Mask of the target's Gaussians that are left out."""
+
+    def __repr__(self) -> str:
+        objects = " and ".join(f"{placed.gaussians.count:,}" for placed in self.objects) or "none"
+        return f"Composite(target of {self.kept_count:,} Gaussians, objects of {objects})"
+
+    _repr_png_ = draw_in_notebook
 
     def bake(self) -> tuple[Gaussians, Bool[Tensor, "b"]]:
         """Make the scene to write or to draw; returns it and a mask of the objects' Gaussians.

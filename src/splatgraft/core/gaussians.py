@@ -9,6 +9,7 @@ from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.rotations import rotation_from_quaternion
+from splatgraft.runtime.notebook import draw_in_notebook
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,11 @@ class Gaussians:
     """Opacities before the sigmoid."""
     sh: Float[Tensor, "n k 3"]
     """Spherical-harmonic coefficients of sRGB minus one half, k = (degree + 1)^2."""
+
+    def __repr__(self) -> str:
+        return f"Gaussians({self.count:,} of SH degree {self.sh_degree})"
+
+    _repr_png_ = draw_in_notebook
 
     @property
     def count(self) -> int:

@@ -10,6 +10,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.distortion import Distortion
 from splatgraft.core.images import read_alpha, read_mask, read_stored_rgb, resize
+from splatgraft.runtime.notebook import draw_in_notebook
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,13 @@ class PosedImages:
 
     def __len__(self) -> int:
         return len(self.cameras)
+
+    def __repr__(self) -> str:
+        masks = sum(path is not None for path in self.mask_paths)
+        size = f" of {self.cameras.width} x {self.cameras.height}" if len(self) and self.cameras.same_size else ""
+        return f"PosedImages({len(self)} images{size}, {masks} masks, {len(self.points):,} points)"
+
+    _repr_png_ = draw_in_notebook
 
     def image(self, index: int) -> Float[Tensor, "h w 3"]:
         """Read the image of camera `index`, sRGB, undistorted and resampled to the camera's size."""

@@ -29,6 +29,7 @@ from splatgraft.relighting.shading import (
     unknown_origin_ratio,
 )
 from splatgraft.runtime.note import Note
+from splatgraft.runtime.notebook import draw_in_notebook
 
 _MIN_SLOPE = 1e-6  # slope of a ratio over view directions; smaller ones are invisible, and below 1e-20 squares are 0
 
@@ -90,6 +91,12 @@ class Relit:
     """Linear rgb irradiance on the Gaussians of each object at the new place."""
     prepared: tuple[PreparedObject, ...] = ()
     """Normals and old light of each object; empty if there was no transfer."""
+
+    def __repr__(self) -> str:
+        count, own = self.gaussians.count, int(self.is_object.sum())
+        return f"Relit({count:,} Gaussians, {own:,} of objects, {self.light or 'no light'})"
+
+    _repr_png_ = draw_in_notebook
 
     def bake(self, weights: LayerWeights = LayerWeights()) -> tuple[Gaussians, Bool[Tensor, "b"]]:
         """Apply the layers, and split wide Gaussians of the target around the objects, as `Composite.bake` does.

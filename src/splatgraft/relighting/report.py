@@ -52,11 +52,12 @@ def _panorama(
     image = (seen * shown + (1 - seen) * _UNSEEN).reshape(_HEIGHT, 2 * _HEIGHT, 3)
     canvas = np.ascontiguousarray((image * 255).byte().numpy())
     for source in found.light.sources:
-        _circle(canvas, source, frame)
+        mark_source(canvas, source, frame)
     return torch.from_numpy(canvas).float() / 255
 
 
-def _circle(canvas: np.ndarray, source: LightSource, frame: Float[Tensor, "3 3"]) -> None:
+def mark_source(canvas: np.ndarray, source: LightSource, frame: Float[Tensor, "3 3"]) -> None:
+    """Draw a circle with a source's name in a panorama of 256 rows, uint8, whose axes are the rows of `frame`."""
     x, y, z = (frame @ torch.tensor(source.direction)).tolist()
     column = (math.atan2(y, x) / (2 * math.pi) + 0.5) * 2 * _HEIGHT
     row = (0.5 - math.asin(max(-1.0, min(1.0, z))) / math.pi) * _HEIGHT

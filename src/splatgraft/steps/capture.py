@@ -120,7 +120,9 @@ class Capture:
             context.console.tell(*(Note(f"{self.capture}: doubtful: {d}", "warning") for d in report.doubts))
             write_pose_report(folder, report)
             by_stem = {photo.stem: photo for photo in photos.paths}
-            originals = tuple(by_stem[Path(name).stem] for name in posed.cameras.names)
+            stems = [Path(name).stem for name in posed.cameras.names]
+            # the views of panoramas are no photos of their own, with another compass direction each
+            originals = tuple(by_stem[stem] for stem in stems) if set(stems) <= by_stem.keys() else ()
         require_coverage(posed, str(self.capture))
         write_capture(folder, posed.limited(self.max_side) if self.max_side > 0 else posed)
         if originals:

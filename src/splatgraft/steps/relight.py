@@ -75,7 +75,7 @@ class Relight:
             gaussians, is_object = composite.bake()
             notes = (Note("The light transfer was off: the object is pasted as it was captured."),)
         else:
-            cameras, sources = read_cameras(self.cameras), self._sources()
+            cameras, sources = read_cameras(self.cameras), self.sources()
             clock = read_clock_sun(self.cameras)
             relit = relight(composite, cameras, sources=sources, light=self.given(), clock=clock, options=self.options)
             found = relit.light
@@ -100,7 +100,8 @@ class Relight:
             raise ValueError(f"{self.given_light}: expected a light.json, found no such file")
         return light_from_json(self.given_light.read_text(encoding="utf-8"), name=str(self.given_light))
 
-    def _sources(self) -> list[SourceScene | None]:
+    def sources(self) -> list[SourceScene | None]:
+        """Read the scene that each object was taken from; None if it is not known."""
         source = None
         if self.surroundings is not None:
             if self.object_cameras is None:

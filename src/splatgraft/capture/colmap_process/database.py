@@ -37,7 +37,8 @@ def find_features(job: Job) -> None:
     alone = [names[0] for names in job.groups if len(names) == 1]
     groups = [(pycolmap.CameraMode.SINGLE, names) for names in job.groups if len(names) > 1]
     groups += [(pycolmap.CameraMode.PER_IMAGE, alone)] if alone else []
-    photos, reader = Path(job.photos), pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+    photos = Path(job.photos)
+    reader = pycolmap.ImageReaderOptions(camera_model=job.camera_model, camera_mask_path=job.common_mask)
     if not database.exists():
         partial = fresh(job.folder / "partial.db")
         pycolmap.Database.open(partial).close()

@@ -35,6 +35,10 @@ class Job:
     """CPU threads."""
     seed: int
     """Seed of the random choices of matching and mapping."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP's name of the lens; EQUIRECTANGULAR for 360-degree panoramas."""
+    common_mask: str = ""
+    """Mask for all photos, black where no features are found; empty string without one."""
 
     @property
     def names(self) -> list[str]:

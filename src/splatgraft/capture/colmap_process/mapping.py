@@ -24,6 +24,7 @@ from typing import Any
 import pycolmap
 
 from .database import (
+    copy_database,
     copy_with_features,
     find_features,
     inside_masks,
@@ -123,7 +124,9 @@ def _answer(job: Job, clock: Clock, name: str, level: str) -> Answer:
         path.parent.mkdir(exist_ok=True)
         matched, work = _database(job, name), job.folder / "mapping.db"
         with clock.phase("mapping"):
-            models = _global_models(job, with_calibrated_focals(matched, work, job.seed))
+            is_calibrated = job.camera_model == "EQUIRECTANGULAR"
+            work = copy_database(matched, work) if is_calibrated else with_calibrated_focals(matched, work, job.seed)
+            models = _global_models(job, work)
         with clock.phase("refinement"):
             better = [refined(job, work, models)] if models else []
         found = best_of(matched, [*models, *better], len(job.names))

@@ -186,10 +186,12 @@ def _numbers(matches: Matches, model: Any) -> Answer:
 
 
 def lens_numbers(camera: Any) -> list[float]:
-    """Return fx, fy, cx, cy, k1, k2, p1, p2 of a camera with a SIMPLE_RADIAL or OPENCV lens."""
+    """Return fx, fy, cx, cy, k1, k2, p1, p2 of a camera with a SIMPLE_RADIAL or OPENCV lens; none of a panorama."""
     numbers = camera.params.tolist()
     if len(numbers) == 8:
         return numbers
+    if camera.model == pycolmap.CameraModelId.EQUIRECTANGULAR:
+        return []
     f, cx, cy, k = numbers
     return [f, f, cx, cy, k, 0.0, 0.0, 0.0]
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
+from splatgraft.runtime.notebook import draw_in_notebook
 
 _FORMAT = "splatgraft light 1"
 _AMBIENT_DEGREE = 2  # of the spherical harmonics
@@ -75,6 +76,12 @@ class Light:
     """Share of the directions around the place that were captured, in [0, 1]."""
     unseen_up: float = 0.0
     """Share of the directions within 60 degrees of up that were not captured, in [0, 1]."""
+
+    def __repr__(self) -> str:
+        names = ", ".join(source.name for source in self.sources) or "none"
+        return f"Light(sources: {names}; {self.coverage:.0%} of the directions captured)"
+
+    _repr_png_ = draw_in_notebook
 
     def ambient_radiance(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Return the linear rgb radiance of the ambient light from unit `directions`, at least 0."""
