@@ -137,17 +137,17 @@ def test_a_plan_says_the_memory_of_the_paper_s_training_in_shards_and_in_copies(
     words = ("flux", str(tmp_path / "out"), "--recipe", "paper")
     (device, host, disk), line = said_memory(capsys, *words)
     assert "on each GPU (4, in shards)" in line
-    # FLUX.1-schnell has 11.9 billion weights: 16 bytes each over four GPUs, and 2 bytes for casts; an H100 has 80 GB
-    assert 11.9 * 16 / 4 < device < 80
+    # FLUX.1-schnell has 11.89 billion weights: 16 bytes each over four GPUs, and 2 bytes for casts; an H100 has 80 GB
+    assert 11.89 * 16 / 4 < device < 80
     # each process loads 4 bytes a weight
-    assert 4 * 11.9 * 4 < host < 4 * 11.95 * 4
+    assert 4 * 11.89 * 4 < host < 4 * 11.9 * 4
     # three states of 12 bytes a weight, and the model
-    assert 11.9 * 40 < disk < 11.95 * 40
+    assert 11.89 * 40 < disk < 11.9 * 40
     (device, *_), line = said_memory(capsys, *words, "--parallel", "copies")
     assert "a copy of all weights in each" in line
-    assert 11.9 * 16 < device < 210
+    assert 11.89 * 16 < device < 210
     (device, *_), _ = said_memory(capsys, *words, "--lora", "16", "--parallel", "copies")
-    assert 2 * 11.9 < device < 40
+    assert 2 * 11.89 < device < 40
     # Stable Diffusion 2's UNet has 866 million weights
     (device, host, disk), _ = said_memory(capsys, "removal", str(tmp_path / "out"), "--recipe", "removal")
     assert 16 * 0.866 < device < 40

@@ -228,7 +228,7 @@ def compose_scene(
         seconds[f"reconstruct {side}"] = perform_if_stale(step, console)
     source = work / "source" / "scene" / SCENE_FILE
     for step in options.segment(source, work / "source" / "capture", work):
-        seconds["segment" if isinstance(step, Segment) else "mask"] = perform_if_stale(step, console)
+        seconds["mask" if isinstance(step, BirefnetMasks) else "segment"] = perform_if_stale(step, console)
     scene = ComposedScene(ground_truth.name, work, light=ground_truth.light, seconds=seconds, views=ground_truth.target)
     compose = place_step(options.pipeline, scene, work / "object" / OBJECT_FILE, ground_truth.placement)
     seconds["compose"] = perform_if_stale(compose, console)

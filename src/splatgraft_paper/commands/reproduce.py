@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,8 @@ class Stage:
     """Results and downloads, GB."""
     command: str
     """Arguments of `splatgraft paper`, with names of files in braces."""
+    gpu: int = 0
+    """GPU memory, GB; that of a training is in its own plan."""
 
 
 # Disk: a picture of 704x496 has 0.38 MB (1.1 bytes a pixel in data/benchmark), one of the object alone 0.05 MB, its
@@ -59,6 +61,7 @@ STAGES = (
     Stage(
         "generated", "removal", _NO_FIGURE, 39,
         f"synth generated {_OUT}/generated --removal {_OUT}/removal/model {_RELIT}",
+        gpu=36,  # FLUX and its text encoders in 16 bits
     ),
     Stage("orida", "", _NO_FIGURE, 5, f"synth orida {_OUT}/orida --orida {{orida}} {_RELIT}"),
     Stage("paper", "pairs generated orida embed-flux", _HARMONIZER, 490, f"{_TRAIN} {_PAIRS} {_GENERATED} {_ORIDA}"),
@@ -72,6 +75,7 @@ STAGES = (
         f"paper={_OUT}/paper/model without-blender={_OUT}/without-blender/model "
         f"without-flux={_OUT}/without-flux/model without-orida={_OUT}/without-orida/model "
         f"{_PAIRS} {_GENERATED} {_ORIDA} {{metrics}}",
+        gpu=25,  # measured for a harmoniser of FLUX's size, docs/results.md
     ),
 )  # fmt: skip
 TRAININGS = "training"
@@ -137,7 +141,7 @@ class Reproduce:
         for stage in STAGES:
             if stage.name in names:
                 before = tuple(jobs[name].folder / STEP_FILE for name in stage.after.split() if name in jobs)
-                words = [word.replace(str(self.out), "OUT") for word in self.words(stage.name)]
+                words = replace(self, out=Path("OUT")).words(stage.name)
                 jobs[stage.name] = Job("stage", self.out / "stages" / stage.name, {"stages": before}, {"words": words})
         return jobs
 
@@ -172,7 +176,8 @@ class Reproduce:
             stale = _is_stale(jobs[stage.name])
             needed += stage.disk * stale
             state = "to do" if stale else "done"
-            console.say(f"{stage.name:<16} {state:<6} {stage.disk:>4} GB of disk; hours: {stage.hours}")
+            gpu = f", {stage.gpu} GB of GPU memory" if stage.gpu else ""
+            console.say(f"{stage.name:<16} {state:<6} {stage.disk:>4} GB of disk{gpu}; hours: {stage.hours}")
             if self.plan:
                 console.say(f"    splatgraft {shlex.join(self.words(stage.name))}")
             if stale and stage.command.startswith("train") and "--recipe" in stage.command:
@@ -184,15 +189,7 @@ class Reproduce:
         """Run a command, on several GPUs by torchrun."""
         gpus = torch.cuda.device_count()
         if words[1:3] == ["train", "flux"] and gpus > 1 and "--plan" not in words:
-            launcher = [
-                "-m",
-                "torch.distributed.run",
-                "--standalone",
-                "--nproc-per-node",
-                str(gpus),
-                "-m",
-                "splatgraft",
-            ]
+            launcher = f"-m torch.distributed.run --standalone --nproc-per-node {gpus} -m splatgraft".split()
             status = subprocess.run([sys.executable, *launcher, *words], check=False).returncode
         else:
             status = main(words)

@@ -182,13 +182,14 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
     recipe = Recipe.read(options.recipe) if options.recipe else None
     processes = join_processes(options.loop)
     loop, count = options.loop, processes.num_processes
-    if options.plan and recipe and count == 1:
+    if options.plan and recipe and count == 1 and not loop.cpu:
         # without a launcher the plan is for the GPUs here, or else for the recipe's number
         count = torch.cuda.device_count() or recipe.processes
     elif not options.plan:
         loop = replace(loop, cpu=processes.device.type == "cpu")
     if processes.is_main_process and (options.plan or recipe):
         say_plan(recipe, loop, options.data.size, count, console)
+    loop.check(count)
     data = None if options.plan else open_training_data(options.data, options.loop.seed, recipe)
     if processes.is_main_process and options.base != TINY:
         training_memory(options, loop, count).say_and_check(loop, count, out, console)

@@ -196,7 +196,7 @@ class TrainingMemory:
             if free is not None and getattr(self, name) > free:
                 raise ValueError(
                     f"training: expected about {getattr(self, name) / 1e9:,.1f} GB {places[name]}, found "
-                    f"{free / 1e9:,.1f} GB; try --parallel shards on more GPUs, or --lora"
+                    f"{free / 1e9:,.1f} GB; try --parallel shards on more GPUs (torchrun), or --lora"
                 )
 
 
