@@ -212,7 +212,7 @@ def test_the_paper_s_row_pastes_the_object_as_it_is_and_each_table_s_head_says_h
     assert len(set(heads)) == 1
     for words in (
         "paper: quality full (30,000 steps), masks by BiRefNet",
-        "draft (1,000 steps)",
+        "ours: quality draft (1,000 steps)",
         "image-mask",
         "commit",
     ):

@@ -68,6 +68,7 @@ def test_the_object_is_cut_out_by_birefnet_and_cross_entropy_and_pasted(composed
     assert torch.allclose(pasted.log_scales, both.log_scales, atol=1e-6)
 
 
+@pytest.mark.long
 def test_3dgs_dr_pictures_the_object_in_the_target_s_held_out_views(composed):
     made, _ = composed
     settings = MethodSettings(device="cpu", reflections=FitOptions(steps=16, panorama=(8, 16)))

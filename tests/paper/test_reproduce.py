@@ -28,13 +28,19 @@ NAMES = [stage.name for stage in STAGES]
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """Run all stages but Blender's."""
+def inputs(tmp_path_factory):
+    """Write data and tiny weights."""
     root = tmp_path_factory.mktemp("reproduced")
-    arguments = write_inputs(root)
-    (root / "arguments.json").write_text(json.dumps(arguments))
-    assert main(["paper", "reproduce", str(root / "out"), *arguments]) == 0
+    (root / "arguments.json").write_text(json.dumps(write_inputs(root)))
     return root
+
+
+@pytest.fixture(scope="module")
+def whole(inputs):
+    """Run all stages but Blender's."""
+    arguments = json.loads((inputs / "arguments.json").read_text())
+    assert main(["paper", "reproduce", str(inputs / "out"), *arguments]) == 0
+    return inputs
 
 
 def test_the_page_s_commands_are_those_of_the_stages():
@@ -45,6 +51,7 @@ def test_the_page_s_commands_are_those_of_the_stages():
     assert listed == [["splatgraft", *example.words(name)] for name in NAMES]
 
 
+@pytest.mark.long
 def test_all_stages_lead_to_the_tables_and_a_second_run_does_nothing(whole, capsys):
     found = json.loads((whole / "out/tables/paper.json").read_text())
     assert set(found["by_model"]) == {"Ours", "w/o Blender", "w/o Flux", "w/o Orida"}
@@ -59,18 +66,18 @@ def test_all_stages_lead_to_the_tables_and_a_second_run_does_nothing(whole, caps
     assert "stage " not in capsys.readouterr().err
 
 
-def test_a_plan_says_hours_disk_and_memory_and_runs_nothing(whole, capsys):
-    arguments = json.loads((whole / "arguments.json").read_text())
-    assert main(["paper", "reproduce", str(whole / "planned"), *arguments, "--plan"]) == 0
+def test_a_plan_says_hours_disk_and_memory_and_runs_nothing(inputs, capsys):
+    arguments = json.loads((inputs / "arguments.json").read_text())
+    assert main(["paper", "reproduce", str(inputs / "planned"), *arguments, "--plan"]) == 0
     said = capsys.readouterr().err
     assert re.search(r"paper +to do +490 GB of disk; hours: 48 on 4 H100 \(the paper\)", said)
     assert said.count("memory: about") == 5
     assert "GB free at" in said
-    assert not (whole / "planned" / "stages").exists()
+    assert not (inputs / "planned" / "stages").exists()
 
 
-def test_inputs_are_checked_before_the_first_stage(whole, tmp_path, capsys):
-    arguments = json.loads((whole / "arguments.json").read_text())
+def test_inputs_are_checked_before_the_first_stage(inputs, tmp_path, capsys):
+    arguments = json.loads((inputs / "arguments.json").read_text())
     (tmp_path / "settings.toml").write_text("[removel]\nsteps = 1\n")
     for change, line in (
         (["--data", str(tmp_path)], "expected data_3d or data_rotation in it, found neither"),

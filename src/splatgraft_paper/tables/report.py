@@ -345,16 +345,13 @@ def _figure_row(
         if view in matched:
             images[name] = read_rgb(matched[view])
     part = _changed_part(images)
-    labels, shown, insets = [], [], []
+    labels, shown = [], []
     for name in (name for name in columns if name in images):
         image = images[name]
         width = round(image.shape[1] * _ROW_HEIGHT / image.shape[0])
         labels.append(f"{scene.name}: {name}" if not labels else name)
-        shown.append(resize(image, width, _ROW_HEIGHT))
-        insets.append(resize(image[part], width, _ROW_HEIGHT))
-    if not shown:
-        return None
-    return torch.cat([side_by_side(shown, labels), side_by_side(insets, [""] * len(insets))])
+        shown.append(torch.cat([resize(one, width, _ROW_HEIGHT) for one in (image, image[part])]))
+    return side_by_side(shown, labels) if shown else None
 
 
 def _changed_part(images: Mapping[str, Float[Tensor, "h w 3"]]) -> tuple[slice, slice]:
