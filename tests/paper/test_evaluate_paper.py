@@ -219,6 +219,16 @@ def test_the_paper_s_row_pastes_the_object_as_it_is_and_each_table_s_head_says_h
         assert words in heads[0]
 
 
+def test_updates_1_3_and_5_are_pictured(whole):
+    figure = read_rgb(whole.out / "figures" / "updates.png")
+    # linear and geometric, three pictures of 64x48 each, with gaps of 2 and 4
+    assert figure.shape == (2 * (48 + 4), 3 * 64 + 2 * 2, 3)
+    folders = [whole.out / "scenes" / PLAIN / "updates" / "paper@linear" / str(number) for number in (1, 3, 5)]
+    first, third, fifth = (read_rgb(next(folder.glob("*.png"))) for folder in folders)
+    assert not torch.equal(first, third)
+    assert not torch.equal(third, fifth)
+
+
 def table(command, title):
     text = (command.out / "paper.md").read_text()
     return next(part for part in text.split("## ") if part.startswith(title)).splitlines()

@@ -112,9 +112,7 @@ class EvaluatePaper:
             parts.append(f"paper: quality full ({steps:,} steps), masks by BiRefNet, lifted by cross-entropy, pasted")
         if any(method.pipeline == "ours" for method in methods):
             steps = f"{self.options.quality} ({self.options.all_iterations:,} steps)"
-            parts.append(
-                f"ours: quality {steps}, the captures' masks, lifted in closed form, refitted and closed"
-            )
+            parts.append(f"ours: quality {steps}, the captures' masks, lifted in closed form, refitted and closed")
         place = f"on {_device_name(self.options.device)}, commit {source_commit()}"
         return f"Run here: {'; '.join([*parts, f'weights {self.harmonizer_weights or None}', place])}."
 

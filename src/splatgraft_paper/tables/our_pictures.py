@@ -36,6 +36,7 @@ from splatgraft_paper.benchmark.scene import (
     perform_if_stale,
     place_step,
 )
+from splatgraft_paper.commands.consolidate import UPDATES_FOLDER
 from splatgraft_paper.tables.layout import PaperScene, held_out_stems, pictures
 
 
@@ -122,6 +123,15 @@ class MeasureAgreement:
         (folder / METRICS_FILE).write_text(json.dumps(known if len(known) == len(found) else {}))
 
 
+SHOWN_UPDATES = (1, 3, 5)
+"""Iterative updates whose result is pictured, as in the paper's figure."""
+
+
+def updates_folder(scene: Path, method: Method, number: int) -> Path:
+    """Return the folder of a picture after an update, in that of the scene's results."""
+    return scene / "updates" / method.folder_name / str(number)
+
+
 @dataclass(frozen=True)
 class OurPictures:
     """A method's result on a scene."""
@@ -149,6 +159,11 @@ def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Consol
     stems = tuple(held_out_stems(names))
     out = folder / "pictures" / method.folder_name
     perform_if_stale(RenderPictures(result, cameras_from, out, stems=stems, device=run.device), console)
+    for number in SHOWN_UPDATES if method.schedule != "once" else ():
+        update = result.parent / UPDATES_FOLDER / str(number - 1) / SCENE_FILE
+        shown = updates_folder(folder, method, number)
+        middle = (stems[len(stems) // 2],)
+        perform_if_stale(RenderPictures(update, cameras_from, shown, stems=middle, device=run.device), console)
     values: Mapping[str, float] = {}
     if scene.kind == "rotation" and "truth" in scene.folders:
         pasted, views = (

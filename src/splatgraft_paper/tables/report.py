@@ -21,6 +21,7 @@ from splatgraft_paper.benchmark.methods import Method
 from splatgraft_paper.benchmark.table import Table, summarize, table_section
 from splatgraft_paper.tables.layout import Kind, PaperScene, held_out_stems, match_views, pictures
 from splatgraft_paper.tables.measure_pictures import LPIPS
+from splatgraft_paper.tables.our_pictures import SHOWN_UPDATES, updates_folder
 from splatgraft_paper.tables.paper_numbers import (
     COST,
     DATA,
@@ -295,7 +296,7 @@ def _as_json(results: PaperResults, notes: Sequence[str]) -> dict[str, object]:
 
 def _figures(out: Path, results: PaperResults) -> dict[str, list[tuple[Path, str]]]:
     """Write sheets like the paper's figures of 3D results, and the worst scene, by the title of the table beside."""
-    found: dict[str, list[tuple[Path, str]]] = {}
+    found: dict[str, list[tuple[Path, str]]] = {UPDATES.title: _update_figure(out, results)}
     for kind, columns in _FIGURES.items():
         wanted = (*columns[:-1], *results.ours, columns[-1])
         scenes = [scene for scene in results.scenes if scene.kind == kind]
@@ -312,6 +313,24 @@ def _figures(out: Path, results: PaperResults) -> dict[str, list[tuple[Path, str
                 write_image(path, stacked(rows))
                 found.setdefault(_BESIDE[kind], []).append((path, caption))
     return found
+
+
+def _update_figure(out: Path, results: PaperResults) -> list[tuple[Path, str]]:
+    """Write one scene after 1, 3 and 5 updates, a row per schedule, like the paper's figure."""
+    methods = [one for name in results.ours if (one := Method.parse(name)).schedule != "once"]
+    for scene in results.scenes:
+        rows = []
+        for method in methods:
+            folders = [updates_folder(out / "scenes" / scene.name, method, number) for number in SHOWN_UPDATES]
+            if all(folder.is_dir() for folder in folders):
+                images = [read_rgb(next(iter(pictures(folder).values()))) for folder in folders]
+                rows.append(side_by_side(images, [f"{method.name}, update {number}" for number in SHOWN_UPDATES]))
+        if rows:
+            path = out / "figures" / "updates.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_image(path, stacked(rows))
+            return [(path, f"{scene.name} after 1, 3 and 5 updates")]
+    return []
 
 
 def _worst_scene(results: PaperResults, kind: Kind) -> tuple[str, Measured] | None:
