@@ -101,11 +101,11 @@ def killed_in(stage, arguments):
             os.kill(os.getpid(), signal.SIGKILL)
 
     reproduce.Reproduce._run, console._Lines.__call__ = run, progress
+    torch.set_num_threads(1)  # in the child alone, because torch's pool of threads does not outlive a fork
     os._exit(main(arguments))
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(1)
     root, *stages = sys.argv[1:]
     arguments = json.loads((Path(root) / "arguments.json").read_text())
     statuses = [killed_in(stage, ["paper", "reproduce", f"{root}/killed", *arguments]) for stage in [*stages, None]]
