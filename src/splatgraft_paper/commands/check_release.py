@@ -149,10 +149,11 @@ class CheckRelease:
         note = f"Weights {self.weights}; against the authors' pictures, which are renders of consolidated scenes."
         self.out.mkdir(parents=True, exist_ok=True)
         (self.out / "release.md").write_text(
-            Table("The release's weights on its composites", ("scene", *names), cells, note).markdown() + "\n"
+            Table("The release's weights on its composites", ("scene", *names), cells, note).markdown() + "\n",
+            encoding="utf-8",
         )
         finite = {n: {key: v if math.isfinite(v) else None for key, v in row.items()} for n, row in rows.items()}
-        (self.out / "release.json").write_text(json.dumps(finite, indent=1, allow_nan=False))
+        (self.out / "release.json").write_text(json.dumps(finite, indent=1, allow_nan=False), encoding="utf-8")
         write_image(self.out / "sheet.png", stacked(sheet))
 
 

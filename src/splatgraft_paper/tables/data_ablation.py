@@ -107,7 +107,7 @@ def measure_models(run: DataAblation, console: Console) -> MeasuredModels:
             measure = MeasurePictures(*folders, at / f"{option}_metrics", run.metrics, all_views=True)
             for step in (truth, made, measure):
                 perform_if_stale(step, console)
-            read = json.loads((measure.out / METRICS_FILE).read_text())["values"]
+            read = json.loads((measure.out / METRICS_FILE).read_text(encoding="utf-8"))["values"]
             read |= pooled_distances({option: [measure]}).get(option, {})
             values |= {f"{name} {SOURCES[option]}": read[name] for name in _METRICS if name in read}
             console.say(f"{model}, {SOURCES[option]}: {read['psnr']:.2f} dB on {len(pairs)} pairs")

@@ -120,7 +120,7 @@ class MeasureAgreement:
         found = {"disagreement": made, "disagreement_truth": true}
         values = {name: disagreement(images, depths, masks, views.cameras) for name, images in found.items()}
         known = {name: value for name, value in values.items() if value is not None}
-        (folder / METRICS_FILE).write_text(json.dumps(known if len(known) == len(found) else {}))
+        (folder / METRICS_FILE).write_text(json.dumps(known if len(known) == len(found) else {}), encoding="utf-8")
 
 
 SHOWN_UPDATES = (1, 3, 5)
@@ -176,7 +176,7 @@ def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Consol
         at = folder / "agreement" / method.folder_name
         for step in (render_views, MeasureAgreement(result, views, scene.folders["truth"], at, run.device)):
             perform_if_stale(step, console)
-        values = json.loads((at / METRICS_FILE).read_text())
+        values = json.loads((at / METRICS_FILE).read_text(encoding="utf-8"))
     return OurPictures(out, {**composed.seconds, **seconds}, values)
 
 

@@ -297,7 +297,7 @@ def read_split(folder: Path) -> Split | None:
     if not path.is_file():
         return None
     try:
-        found: Split = json.loads(path.read_text())
+        found: Split = json.loads(path.read_text(encoding="utf-8"))
         return {
             name: [{"trained": one["trained"], "held_out": one["held_out"]} for one in found[name]] for name in found
         }
