@@ -89,26 +89,39 @@ def removal_folder(folder: Path) -> Path:
     return folder
 
 
-def kontext_folder(folder: Path) -> Path:
-    """Write a whole FluxKontextPipeline of the classes in diffusers' own tests, tiny, with a few words."""
-    from diffusers import FlowMatchEulerDiscreteScheduler, FluxKontextPipeline
-    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer, T5Config, T5EncoderModel, T5TokenizerFast
+def clip_parts(width: int) -> dict:
+    """Return a text encoder of CLIP and its tokenizer, tiny, with a few words."""
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTokenizer
 
     words = ["<|startoftext|>", "<|endoftext|>", *(f"{letter}</w>" for letter in "abcdefghij")]
-    pieces = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0), *((f"\u2581{letter}", -1.0) for letter in "abcdefghij")]
     torch.manual_seed(4)
-    clip = CLIPTextConfig(
-        bos_token_id=0, eos_token_id=1, pad_token_id=1, hidden_size=POOLED, projection_dim=POOLED, intermediate_size=37,
+    config = CLIPTextConfig(
+        bos_token_id=0, eos_token_id=1, pad_token_id=1, hidden_size=width, projection_dim=width, intermediate_size=37,
         num_attention_heads=4, num_hidden_layers=2, vocab_size=len(words),
     )  # fmt: skip
+    tokenizer = CLIPTokenizer(vocab={word: i for i, word in enumerate(words)}, merges=[], model_max_length=77)
+    return {"text_encoder": CLIPTextModel(config), "tokenizer": tokenizer}
+
+
+def pipeline_folder(folder: Path, kind: str, **transformer) -> Path:
+    """Write a whole pipeline of FLUX of a class of diffusers, of the classes in its own tests, tiny."""
+    import diffusers
+    from transformers import T5Config, T5EncoderModel, T5TokenizerFast
+
+    pieces = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0), *((f"\u2581{letter}", -1.0) for letter in "abcdefghij")]
+    clip = clip_parts(POOLED)
     t5 = T5Config(vocab_size=200, d_model=TEXT, d_kv=8, d_ff=32, num_layers=1, num_heads=2)
-    FluxKontextPipeline(
-        scheduler=FlowMatchEulerDiscreteScheduler(),
+    getattr(diffusers, kind)(
+        scheduler=diffusers.FlowMatchEulerDiscreteScheduler(),
         vae=tiny_autoencoder(),
-        text_encoder=CLIPTextModel(clip),
-        tokenizer=CLIPTokenizer(vocab={word: i for i, word in enumerate(words)}, merges=[], model_max_length=77),
         text_encoder_2=T5EncoderModel(t5),
         tokenizer_2=T5TokenizerFast(vocab=pieces, extra_ids=0),
-        transformer=tiny_transformer(guidance_embeds=True),
+        transformer=tiny_transformer(**transformer),
+        **clip,
     ).save_pretrained(folder)
     return folder
+
+
+def kontext_folder(folder: Path) -> Path:
+    """Write a whole FluxKontextPipeline."""
+    return pipeline_folder(folder, "FluxKontextPipeline", guidance_embeds=True)

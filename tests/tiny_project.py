@@ -62,11 +62,17 @@ def ball() -> Gaussians:
 
 
 def photograph(
-    folder: Path, scene: Gaussians, object_: Gaussians | None, around_deg: float = 360.0, *, width: int = 48
+    folder: Path,
+    scene: Gaussians,
+    object_: Gaussians | None,
+    around_deg: float = 360.0,
+    *,
+    width: int = 48,
+    views: int = 8,
 ) -> None:
-    """Write a capture of `scene` by 8 cameras of 48x36 pixels or larger, with masks of `object_` if it is given."""
-    angles = torch.arange(8) * math.radians(around_deg / 8)
-    eyes = torch.stack([1.6 * angles.cos(), 1.6 * angles.sin(), torch.full((8,), 1.0)], 1)
+    """Write a capture of `scene` by cameras of 48x36 pixels or larger, with masks of `object_` if it is given."""
+    angles = torch.arange(views) * math.radians(around_deg / views)
+    eyes = torch.stack([1.6 * angles.cos(), 1.6 * angles.sin(), torch.full((views,), 1.0)], 1)
     poses = look_at(eyes, torch.tensor([0.0, 0, 0.15]), torch.tensor([0.0, 0, 1]))
     cameras = pinhole(poses, 45.0 / 48 * width, width=width, height=36 * width // 48)
     whole = scene if object_ is None else concatenate([scene, object_])

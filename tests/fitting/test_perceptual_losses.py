@@ -111,6 +111,15 @@ def test_lpips_has_the_published_structure(weights):
     assert float(loss(target, target)) == 0
 
 
+def test_lpips_of_3dgs_gives_the_network_pictures_from_0_to_1(weights):
+    a, b = torch.rand(2, 24, 32, 3, generator=torch.Generator().manual_seed(3))
+    published, of_3dgs = lpips_vgg(weights), lpips_vgg(weights, black=0)
+    # the published scaling maps x to 2 x - 1, so these pictures reach the network as a and b
+    expected = published((a + 1) / 2, (b + 1) / 2)
+    assert float(of_3dgs(a, b)) == pytest.approx(float(expected), rel=1e-4)  # float32 through 13 layers
+    assert float(of_3dgs(a, b)) != pytest.approx(float(published(a, b)), rel=0.01)
+
+
 def test_the_networks_weights_are_copied_once(weights, monkeypatch):
     loss, copied, original = lpips_vgg(weights), [], torch.Tensor.to
 

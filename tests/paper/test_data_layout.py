@@ -1,9 +1,11 @@
 """Scenes of the authors' data set and the matching of pictures to views."""
 
 import json
+import os
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from paper_data import put
@@ -12,11 +14,15 @@ from tiny_project import ball, plane
 
 from splatgraft.cli import main
 from splatgraft.core.gaussians import concatenate
+from splatgraft.core.images import read_rgb
 from splatgraft.formats import read_cameras, read_gaussians, write_cameras
 from splatgraft.rendering import render
+from splatgraft.runtime.console import Console
 from splatgraft.steps.segment import Segment
+from splatgraft_paper.benchmark.image_features import INCEPTION_FILE, frechet_distance
+from splatgraft_paper.benchmark.scene import perform_if_stale
 from splatgraft_paper.tables.layout import find_scenes, held_out_stems, match_views, pictures
-from splatgraft_paper.tables.measure_pictures import padded_ssim
+from splatgraft_paper.tables.measure_pictures import MeasurePictures, MetricOptions, padded_ssim, pooled_distances
 from splatgraft_paper.tables.paper_numbers import published_name
 
 SOFA, TRUCK = "bathtub_57e_in_blend_57eadb", "truck_in_garden"
@@ -165,3 +171,38 @@ def test_our_methods_run_on_pasted_pictures_and_masks_alone(tmp_path, monkeypatc
     assert len(read_cameras(work / "source/capture")) == 8
     means = read_gaussians(work / "object/object.ply").means
     assert torch.allclose(means.median(0).values, torch.tensor([0, 0, 0.3]), atol=0.15)
+
+
+def test_fid_over_scenes_comes_from_the_features_that_each_scene_keeps(tmp_path, monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    asked = []
+
+    def features(images):
+        asked.append(len(images))
+        return np.stack([image.mean((0, 1)).double().numpy() for image in images])
+
+    monkeypatch.setattr("splatgraft_paper.tables.measure_pictures.inception_features", lambda folder: features)
+    (tmp_path / INCEPTION_FILE).write_bytes(b"weights")
+    steps, everything = [], {"made": [], "true": []}
+    for scene in ("a", "b"):
+        for stem in ("0", "1", "2"):
+            for kind, images in everything.items():
+                put(tmp_path / scene / kind / f"{stem}.png", torch.rand(12, 16, 3, generator=generator))
+                images.append(read_rgb(tmp_path / scene / kind / f"{stem}.png"))
+        options = MetricOptions(tmp_path, fid=True)
+        folders = (tmp_path / scene / "made", tmp_path / scene / "true", tmp_path / scene / "out")
+        steps.append(MeasurePictures(*folders, options, all_views=True))
+        perform_if_stale(steps[-1], Console())
+    count = len(asked)
+    found = pooled_distances({"both": steps, "one": steps[:1]})
+    made, true = (features(images) for images in everything.values())
+    assert found["both"]["fid"] == pytest.approx(frechet_distance(made, true))
+    assert found["one"]["fid"] == pytest.approx(frechet_distance(made[:3], true[:3]))
+    # nothing is computed again, but with other weights
+    for changed in (False, True):
+        if changed:
+            os.utime(tmp_path / INCEPTION_FILE, ns=(0, 0))
+        asked.clear()
+        perform_if_stale(steps[0], Console())
+        assert len(asked) == (3 if changed else 0)
+    assert count == 6

@@ -1,13 +1,23 @@
 """Recipes hold the paper's numbers, are printed before anything is loaded, and the user's own options override them."""
 
+import re
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+pytest.importorskip("diffusers")
+
+from tiny_pairs import relit_folder
+from tiny_training import QUICK, training
+
 from splatgraft.cli import main
+from splatgraft.reconstruction.options import available_memory
 from splatgraft.runtime.hub import REPOSITORIES, hub_id
 from splatgraft_paper.training import recipes as recipes_module
-from splatgraft_paper.training.flux import FluxTrainingOptions
+from splatgraft_paper.training.flux import FluxTrainingOptions, training_memory
+from splatgraft_paper.training.pairs import DataOptions
 from splatgraft_paper.training.recipes import Recipe
 from splatgraft_paper.training.removal import RemovalTrainingOptions
 
@@ -113,3 +123,61 @@ def test_a_recipe_of_one_s_own_is_a_file(tmp_path, capsys):
     path.write_text("title = 3\n")
     assert main(["paper", "train", "flux", str(tmp_path / "out"), "--recipe", str(path), "--plan"]) == 2
     assert "mine.toml: expected a recipe with the keys of the shipped ones, found" in capsys.readouterr().err
+
+
+def said_memory(capsys, *words):
+    """Return GB on each device, of the machine and of the disk, from the printed plan."""
+    capsys.readouterr()
+    assert main(["paper", "train", *words, "--plan"]) == 0
+    line = next(line for line in capsys.readouterr().err.splitlines() if line.startswith("memory: about"))
+    return [float(number.replace(",", "")) for number in re.findall(r"([\d,.]+) GB", line)], line
+
+
+def test_a_plan_says_the_memory_of_the_paper_s_training_in_shards_and_in_copies(tmp_path, capsys):
+    words = ("flux", str(tmp_path / "out"), "--recipe", "paper")
+    (device, host, disk), line = said_memory(capsys, *words)
+    assert "on each GPU (4, in shards)" in line
+    # FLUX.1-schnell has 11.89 billion weights: 16 bytes each over four GPUs, and 2 bytes for casts; an H100 has 80 GB
+    assert 11.89 * 16 / 4 < device < 80
+    # each process loads 4 bytes a weight
+    assert 4 * 11.89 * 4 < host < 4 * 11.9 * 4
+    # three states of 12 bytes a weight, and the model
+    assert 11.89 * 40 < disk < 11.9 * 40
+    (device, *_), line = said_memory(capsys, *words, "--parallel", "copies")
+    assert "a copy of all weights in each" in line
+    assert 11.89 * 16 < device < 210
+    (device, *_), _ = said_memory(capsys, *words, "--lora", "16", "--parallel", "copies")
+    assert 2 * 11.89 < device < 40
+    # Stable Diffusion 2's UNet has 866 million weights
+    (device, host, disk), _ = said_memory(capsys, "removal", str(tmp_path / "out"), "--recipe", "removal")
+    assert 16 * 0.866 < device < 40
+    assert host == pytest.approx(4 * 0.866, abs=0.1)
+
+
+def test_what_cannot_fit_is_refused_before_anything_is_loaded(tmp_path, capsys):
+    if (available_memory("cpu") or 0) > 190e9 and shutil.disk_usage(tmp_path).free > 500e9:
+        pytest.skip("this machine could train FLUX")
+    words = ["paper", "train", "flux", str(tmp_path / "out"), "--cpu", "--generated", str(relit_folder(tmp_path / "a"))]
+    for plan in ([], ["--plan"]):
+        assert main([*words, *plan]) == 2
+        said = capsys.readouterr().err
+        assert re.search(r"training: expected about [1-4]\d\d\.\d GB .*, found .* GB; try --parallel shards", said)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("more", [{}, {"ema": 0.5}])
+def test_the_counted_bytes_are_those_of_a_training(tmp_path, more):
+    loop = replace(QUICK, steps=2, **more)
+    run = training(tmp_path, "out", loop)
+    run.train()
+    options = FluxTrainingOptions(base=str(tmp_path / "base"), data=DataOptions(size="32x32"), loop=loop)
+    memory = training_memory(options, loop, 1)
+    network = run.task.network
+    count = sum(p.numel() for p in network.parameters())
+    copies = 5 if more else 4  # weights, gradients and Adam's two moments; the average
+    assert memory.state == 4 * copies * count
+    # a state lacks the gradients; torch.save adds 2.2 KB of names and padding to each tensor
+    (state,) = (tmp_path / "out" / "states").glob("*/*.distcp")
+    tensors = (copies - 1) * len(list(network.parameters()))
+    stored = (memory.disk - 4 * count) / 3
+    assert stored < state.stat().st_size < stored + 3000 * tensors

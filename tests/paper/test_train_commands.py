@@ -35,7 +35,7 @@ def test_pairs_become_a_harmonizer_s_folder(tmp_path, capsys):
     assert printed.out.strip() == str(tmp_path / "out" / "model")
     assert "1 pairs to train on, 1 held out" in printed.err
     names = {path.name for path in (tmp_path / "out" / "model").iterdir()}
-    assert names == {"transformer", "vae", "empty_prompt.safetensors", "harmonizer.json"}
+    assert names == {"transformer", "vae", "empty_prompt.safetensors", "harmonizer.json", "split.json"}
     # training can continue from a harmoniser's folder
     again = ["paper", "train", "flux", str(tmp_path / "again"), "--base", str(tmp_path / "out" / "model")]
     assert main([*again, "--generated", str(tmp_path / "relit"), *SMALL]) == 0

@@ -3,20 +3,28 @@
 import base64
 import io
 import json
+import re
 import sys
 import threading
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from shapes import ring
 
+from splatgraft.cli import main
+from splatgraft.core.images import read_rgb
+from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.harmonization import HarmonizerContext, HarmonizerInputs, make_harmonizer
 from splatgraft.harmonization.image_editing import PROMPT
+from splatgraft_paper.benchmark.methods import Method
 from splatgraft_paper.peers.image_editing import KEY_VARIABLE, ImageEditingOptions
-from splatgraft_paper.peers.methods import method_options
+from splatgraft_paper.peers.methods import OptionWords, named_options
 from splatgraft_paper.peers.mv_colight import MVCoLight, network_input
 
 
@@ -42,13 +50,13 @@ MISSING = {
 @pytest.mark.parametrize("name", MISSING)
 def test_what_is_missing_is_one_line(name):
     with pytest.raises(ValueError, match=MISSING[name]) as error:
-        make_harmonizer(method_options(name))
+        make_harmonizer(named_options(OptionWords(name)))
     assert "\n" not in str(error.value)
 
 
 def test_reinhard_changes_the_object_alone_and_brings_it_near_its_surroundings():
     shown = view()
-    image = make_harmonizer(method_options("reinhard")).harmonize(shown)
+    image = make_harmonizer(named_options(OptionWords("reinhard"))).harmonize(shown)
     inside = shown.mask > 0.5
     assert torch.equal(image[~inside], shown.prior[~inside])
     # the grey uniform background spans 0.3-0.5: matched log statistics put the mean within a tenth of that of 0.4
@@ -56,7 +64,7 @@ def test_reinhard_changes_the_object_alone_and_brings_it_near_its_surroundings()
     # and its deviation, 0.2/sqrt(12) = 0.058, replaces the object's of 0.26
     assert image[inside].std(0).max() < 0.09
     nothing = HarmonizerInputs(**{**shown.__dict__, "mask": torch.zeros(40, 60)})
-    assert torch.equal(make_harmonizer(method_options("reinhard")).harmonize(nothing), shown.prior)
+    assert torch.equal(make_harmonizer(named_options(OptionWords("reinhard"))).harmonize(nothing), shown.prior)
 
 
 def test_lbm_is_asked_and_kept_inside_the_object(monkeypatch):
@@ -67,7 +75,7 @@ def test_lbm_is_asked_and_kept_inside_the_object(monkeypatch):
     inference.evaluate = lambda model, image, steps: Image.new("RGB", (8, 8), (255, 0, 0))
     monkeypatch.setitem(sys.modules, "lbm", package)
     monkeypatch.setitem(sys.modules, "lbm.inference", inference)
-    image = make_harmonizer(method_options("lbm")).harmonize(view())
+    image = make_harmonizer(named_options(OptionWords("lbm"))).harmonize(view())
     assert asked == [("jasperai/LBM_relighting", "cpu")]
     assert torch.equal(image[view().mask == 0], view().composite[view().mask == 0])
     assert torch.equal(image[15, 30], torch.tensor([1.0, 0.0, 0.0]))
@@ -178,3 +186,63 @@ def test_mv_colight_sees_squares_whose_shorter_side_has_its_size_and_nothing_is_
     # a disc of a quarter of the height is as wide as high, if all of it is in the first square
     assert abs(int(rows) - 128) <= 2
     assert abs(int(columns) - 128) <= 2
+
+
+def test_a_method_on_the_command_line_has_options_of_its_own():
+    text = "off+image-editing/l1-dssim@linear:max-cost=2,weights=https://host:80/a@b/c"
+    method = Method.parse(text)
+    assert (method.harmonizer, method.loss, method.schedule) == ("image-editing", "l1-dssim", "linear")
+    made = named_options(OptionWords(method.harmonizer, method.options), weights="another")
+    assert made == ImageEditingOptions(weights="https://host:80/a@b/c", max_cost=2.0)
+    # --harmonizer-weights is the default of a method that names none
+    assert named_options(OptionWords("flux"), weights="mine").weights == "mine"
+    assert named_options(OptionWords.parse("mv-colight:checkout=/a,weights=/b")).checkout == Path("/a")
+    other = Method.parse(text.replace("2", "3"))
+    assert (
+        len({method.folder_name, other.folder_name, Method.parse("off+image-editing/l1-dssim@linear").folder_name}) == 3
+    )
+    assert "/" not in method.folder_name
+    for wrong, line in (
+        ("lbm:cost=3", "--methods lbm: expected keys among weights; found cost"),
+        ("image-editing:max_cost=much", "--methods image-editing max_cost: expected float, found 'much'"),
+        ("lbm:weights", "--methods: expected NAME:KEY=VALUE,KEY=VALUE, found lbm:weights"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(line)):
+            named_options(OptionWords.parse(wrong))
+    with pytest.raises(ValueError, match="expected a harmonizer where options are given, found transfer:weights=a"):
+        Method.parse("transfer:weights=a")
+
+
+def test_a_sheet_compares_methods_and_pays_a_service_once(service, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv(KEY_VARIABLE, "secret")
+    folder = tmp_path / "truck" / "views"
+    views = ViewFolder.create(folder, ring(2, size=(60, 40), focal=50.0))
+    for index in range(2):
+        views.write(index, replace(view(), mask=view().mask * index))
+    paid = f"image-editing:max_cost=0.05,weights={service}"
+    words = [
+        "paper",
+        "compare",
+        str(folder),
+        "--out",
+        str(tmp_path / "out"),
+        "--device",
+        "cpu",
+        "--methods",
+        "reinhard",
+        paid,
+    ]
+    assert main(words) == 0
+    assert len(Service.asked) == 1
+    sheet = read_rgb(tmp_path / "out" / "sheet.png")
+    # four pictures of 60x40 at a height of 300, and gaps
+    assert sheet.shape[0] == 304
+    assert 4 * 450 <= sheet.shape[1] < 4 * 460
+    wanted = make_harmonizer(named_options(OptionWords("reinhard"))).harmonize(views.read(1))
+    made = read_rgb(next((tmp_path / "out").glob("*truck/reinhard/images/view.png")))
+    assert (made - wanted).abs().max() < 1 / 255
+    assert main([*words, "lbm"]) == 1
+    assert len(Service.asked) == 1
+    assert "lbm: harmonizer lbm: expected the package lbm" in " ".join(capsys.readouterr().err.split())
+    assert main([*words, "--view", "seven"]) == 2
+    assert "expected the view seven, found" in capsys.readouterr().err

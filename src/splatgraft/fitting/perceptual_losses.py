@@ -75,12 +75,13 @@ def _magnitudes(planes: Float[Tensor, "3 y x"], window: Float[Tensor, "s s"]) ->
     return torch.fft.rfft2(patches * window, norm="ortho").abs()
 
 
-def lpips_vgg(folder: Path | None = None) -> ImageLoss:
+def lpips_vgg(folder: Path | None = None, *, black: float = -1.0) -> ImageLoss:
     """Load LPIPS (Zhang 2018, version 0.1, VGG-16, linear heads) with weights from `folder`.
 
     Args:
         folder: Folder of vgg16-397923af.pth from torchvision and of the heads vgg.pth, which is
             lpips/weights/v0.1/vgg.pth in the lpips package; by default torch hub's cache.
+        black: Value of 0 in the network's input, where 1 stays 1; -1 as published, 0 as in 3DGS's metrics.py.
 
     Raises:
         ValueError: A file is missing or is not these weights.
@@ -112,7 +113,7 @@ def lpips_vgg(folder: Path | None = None) -> ImageLoss:
             raise ValueError(f"lpips: expected images of at least 16x16 pixels, found {tuple(image.shape[:2])}")
         # the input scaling of the published weights
         shift, scale = image.new_tensor([-0.030, -0.088, -0.188]), image.new_tensor([0.458, 0.448, 0.450])
-        x = ((2 * image - 1 - shift) / scale).permute(2, 0, 1)[None]
+        x = (((1 - black) * image + black - shift) / scale).permute(2, 0, 1)[None]
         found = []
         for level, layers in enumerate(placed(x.device, x.dtype)[0]):
             x = F.max_pool2d(x, 2) if level else x

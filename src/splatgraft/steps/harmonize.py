@@ -15,7 +15,7 @@ from splatgraft.folders.harmonized_views import (
     harmonize_with_ray,
 )
 from splatgraft.folders.view_folder import ViewFolder
-from splatgraft.harmonization import EditOptions, FluxOptions, NoneOptions
+from splatgraft.harmonization import EditOptions, FluxOptions, HarmonizerOptions, NoneOptions
 from splatgraft.project.step import Context, Device, Inputs, Positional, plain_options
 
 _WEIGHTS = ("weights", "base", "model", "lora")  # options of the methods that name weights
@@ -45,16 +45,11 @@ class Harmonize:
 
     def inputs(self) -> Inputs:
         """Return all pictures of all views, and the files of weights on this machine; hub ids are options."""
-        named = [path for name in _WEIGHTS if (path := getattr(self.method, name, None)) is not None]
-        weights = tuple(file for path in named for file in _weight_files(path))
-        return {"views": ViewFolder.open(self.views).files(), "weights": weights}
+        return {"views": ViewFolder.open(self.views).files(), "weights": weight_files(self.method)}
 
     def recorded_options(self) -> dict[str, Any]:
-        """Return the options for step.json: the method's name and its own options."""
-        lora = getattr(self.method, "lora", None)
-        # plain options omit paths, but `consolidate` with updates needs this one to make the method again
-        given = {} if lora is None else {"lora": str(lora.resolve())}
-        return plain_options({"method": self.method.name, **vars(self.method)}) | given
+        """Return the options for step.json."""
+        return method_record(self.method)
 
     def write(self, folder: Path, context: Context) -> None:
         """Write one image per view."""
@@ -73,7 +68,21 @@ class Harmonize:
         shutil.copytree(kept / "images", folder / "images")
 
 
-def _weight_files(named: Path | str) -> list[Path]:
+def method_record(method: HarmonizerOptions) -> dict[str, Any]:
+    """Return a method's name and its own options as plain JSON."""
+    lora = getattr(method, "lora", None)
+    # plain options omit paths, but `consolidate` with updates needs this one to make the method again
+    given = {} if lora is None else {"lora": str(lora.resolve())}
+    return plain_options({"method": method.name, **vars(method)}) | given
+
+
+def weight_files(method: HarmonizerOptions) -> tuple[Path, ...]:
+    """List the files of weights on this machine that a method names; hub ids are options."""
+    named = [path for name in _WEIGHTS if (path := getattr(method, name, None)) is not None]
+    return tuple(file for path in named for file in _files_of(path))
+
+
+def _files_of(named: Path | str) -> list[Path]:
     """List the files of a file or folder of weights; none of a hub id."""
     path = Path(named)
     if path.is_dir():

@@ -144,7 +144,9 @@ class Segment:
             feature = box.contains(scene.means).float()
         else:
             masked = self._masked_views(capture, on_device, folder, box, context)
-            cameras, small = _small_masks(masked, _LIFTED_SIDE_PX)
+            # the paper's training of the feature takes full masks
+            full = int(masked.views.cameras.sizes.max())
+            cameras, small = _small_masks(masked, full if self.options.method == "bce" else _LIFTED_SIDE_PX)
             feature = lift_masks(on_device, cameras.to(device), small, self.options, progress=context.progress)
             if masked.region is not None:
                 feature = feature * masked.region.allows(on_device.means)

@@ -28,7 +28,8 @@ def inception_features(folder: Path | None) -> Features:
         from torch_fidelity.feature_extractor_inceptionv3 import FeatureExtractorInceptionV3
     except (ImportError, RuntimeError) as error:
         raise ValueError(
-            f"torch_fidelity: expected an installed package with a torchvision that fits torch, found {error}"
+            "torch_fidelity: expected an installed package (pip install torch-fidelity) with a torchvision that fits "
+            f"torch, found {error}"
         ) from error
     network = FeatureExtractorInceptionV3("inception-v3-compat", ["2048"], feature_extractor_weights_path=str(path))
 

@@ -6,11 +6,11 @@ import platform
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
-from typing import cast
 
 import torch
 
@@ -21,7 +21,6 @@ from splatgraft.fitting.perceptual_losses import lpips_vgg
 from splatgraft.formats import read_capture
 from splatgraft.project.layout import METRICS_FILE
 from splatgraft.project.step import Device
-from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft_paper.benchmark.image_features import (
     Features,
@@ -31,7 +30,14 @@ from splatgraft_paper.benchmark.image_features import (
 )
 from splatgraft_paper.benchmark.measure import REGIONS, MeasureMethod, only_region, true_view
 from splatgraft_paper.benchmark.methods import Method, MethodSettings, run_method
-from splatgraft_paper.benchmark.scene import GroundTruthScene, compose_scene, perform_if_stale
+from splatgraft_paper.benchmark.scene import (
+    ComposedScene,
+    CompositionOptions,
+    GroundTruthScene,
+    Pipeline,
+    compose_scene,
+    perform_if_stale,
+)
 from splatgraft_paper.benchmark.table import Benchmark, Row, as_json, markdown, table_section, tables
 
 
@@ -43,8 +49,8 @@ class BenchmarkRun:
     """Folder of all results."""
     scenes: tuple[GroundTruthScene, ...]
     methods: tuple[Method, ...]
-    options: ReconstructOptions
-    """Options of every reconstruction; their device serves all steps."""
+    composition: CompositionOptions
+    """Options of reconstruction and composition; their device serves all steps."""
     weights: Path | None = None
     """Folder with the weights of LPIPS and Inception."""
     harmonizer_weights: str | None = None
@@ -53,7 +59,7 @@ class BenchmarkRun:
     @property
     def device(self) -> Device:
         """Device of all steps."""
-        return cast(Device, self.options.device)
+        return self.composition.device
 
     def work(self, scene: GroundTruthScene) -> Path:
         """Folder of everything made from one scene."""
@@ -73,8 +79,14 @@ def measure_scene(run: BenchmarkRun, scene: GroundTruthScene, lpips: bool) -> No
     """Run and measure all methods on one scene; write the reason for a method that cannot run."""
     console = Console()
     console.say(f"scene {scene.name}")
-    composed = compose_scene(scene, run.work(scene), run.options, device=run.device, console=console)
+
+    @cache
+    def composed_by(pipeline: Pipeline) -> ComposedScene:
+        work = run.work(scene) / ("" if pipeline == "ours" else "as_paper")
+        return compose_scene(scene, work, replace(run.composition, pipeline=pipeline), console)
+
     for method in run.methods:
+        composed = composed_by(method.pipeline)
         out, outcome = run.measured(scene, method), {}
         try:
             result, seconds = None, {}
@@ -82,6 +94,8 @@ def measure_scene(run: BenchmarkRun, scene: GroundTruthScene, lpips: bool) -> No
                 settings = MethodSettings(run.weights, run.harmonizer_weights, run.device)
                 result, seconds = run_method(method, composed, settings, console)
             shown = None if method.pictures is None else method.pictures / scene.name
+            if result is not None and result.is_dir():
+                result, shown = None, result
             step = MeasureMethod(
                 scene.truth, scene.target, composed.target, out, result, shown, run.weights, lpips, run.device
             )
@@ -127,7 +141,8 @@ def collect_results(run: BenchmarkRun, missing: dict[str, str], failures: list[s
                     floors.append(disagreement)
     notes = [
         f"Every 8th view is held out of reconstruction, harmonisation and consolidation; {_span(counts)} per scene.",
-        f"{len(run.scenes)} scenes, quality {run.options.quality}, {os.cpu_count()} cores of {platform.machine()}, "
+        f"{len(run.scenes)} scenes, quality {run.composition.reconstruction.quality} (full for the method paper), "
+        f"{os.cpu_count()} cores of {platform.machine()}, "
         f"torch on {'CUDA' if torch.cuda.is_available() and run.device != 'cpu' else 'the CPU'}.",
         f"Made by splatgraft {version('splatgraft')}: {shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])}",
     ]

@@ -122,12 +122,15 @@ class Table:
     title: str
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    note: str = ""
+    """Conditions of the measurement, below the title."""
 
     def markdown(self) -> str:
         """Format the table with its title."""
         lines = ["| " + " | ".join(cells) + " |" for cells in (self.head, *self.rows)]
         lines.insert(1, "|" + " --- |" * len(self.head))
-        return f"### {self.title}\n\n" + "\n".join(lines)
+        note = f"{self.note}\n\n" if self.note else ""
+        return f"### {self.title}\n\n{note}" + "\n".join(lines)
 
 
 def tables(benchmark: Benchmark) -> list[Table]:
@@ -230,7 +233,8 @@ def table_section(table: Table) -> str:
         f'<tr><th scope="row">{escape(name)}</th>' + "".join(f"<td>{escape(cell)}</td>" for cell in cells) + "</tr>"
         for name, *cells in table.rows
     )
+    note = f"<p>{escape(table.note)}</p>" if table.note else ""
     return (
-        f'<section><h2>{escape(table.title)}</h2><div class="scroll"><table><thead><tr>{head}</tr></thead>'
+        f'<section><h2>{escape(table.title)}</h2>{note}<div class="scroll"><table><thead><tr>{head}</tr></thead>'
         f"<tbody>{rows}</tbody></table></div></section>\n"
     )

@@ -3,8 +3,9 @@
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import cast
 
-from splatgraft.project.step import Positional, locked
+from splatgraft.project.step import Device, Positional, locked
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task, run_tasks
@@ -16,7 +17,7 @@ from splatgraft_paper.benchmark.run import (
     unmeasurable_metrics,
     write_benchmark_report,
 )
-from splatgraft_paper.benchmark.scene import GroundTruthScene
+from splatgraft_paper.benchmark.scene import CompositionOptions, GroundTruthScene
 
 
 @dataclass(frozen=True)
@@ -28,14 +29,17 @@ class EvaluateBenchmark:
     out: Path = Path("benchmark")
     """Folder for index.html, benchmark.json, benchmark.md and all results."""
     methods: tuple[str, ...] = ("copy-paste", "reinhard", "gain", "transfer", "true-light")
-    """PRIOR[+HARMONIZER][/LOSS][@SCHEDULE], such as off+flux, transfer+flux/l1-dssim, transfer+flux@geometric;
-    or NAME=FOLDER for pictures of another program, FOLDER/SCENE/VIEW.png."""
+    """PRIOR[+HARMONIZER][/LOSS][@SCHEDULE][:KEY=VALUE,..], such as off+flux, transfer+flux/l1-dssim@geometric,
+    off+lbm:weights=FOLDER, off+mv-colight:checkout=FOLDER,weights=FOLDER, off+image-editing:max_cost=20;
+    paper, the paper's pipeline whole; or NAME=FOLDER for pictures of another program, FOLDER/SCENE/VIEW.png."""
     only: tuple[str, ...] = ()
     """Names of scenes; default: all."""
     weights: Path | None = None
     """Folder with the weights of LPIPS and Inception; default: torch hub's cache."""
     harmonizer_weights: str | None = None
     """Weights of the image model that the methods name: folder, file or hub id, as `harmonize --weights` takes them."""
+    birefnet: Path | None = None
+    """BiRefNet's .onnx file for the method paper; fetched once from the hub if not given."""
     at_once: int = 1
     """Number of scenes at a time on this machine."""
     ray: str | None = None
@@ -45,7 +49,8 @@ class EvaluateBenchmark:
     def execute(self, console: Console) -> int:
         """Run what is missing and write the report; return 1 if a scene or a method failed."""
         methods = tuple(Method.parse(text) for text in self.methods)
-        run = BenchmarkRun(self.out, self._scenes(), methods, self.options, self.weights, self.harmonizer_weights)
+        composition = CompositionOptions(self.options, cast(Device, self.options.device), self.birefnet)
+        run = BenchmarkRun(self.out, self._scenes(), methods, composition, self.weights, self.harmonizer_weights)
         missing = unmeasurable_metrics(self.weights)
         for name, reason in missing.items():
             console.say(f"{name}: not measured: {reason}")

@@ -14,7 +14,7 @@ from torch import Tensor
 from splatgraft.consolidation import ImageSequence, consolidate
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import read_rgb, stored_size, write_image
+from splatgraft.core.images import read_rgb, stored_size
 from splatgraft.fitting import l1_dssim
 from splatgraft.fitting.perceptual_losses import ImageLoss, lpips_vgg, windowed_fourier
 from splatgraft.folders.view_folder import ViewFolder
@@ -36,6 +36,7 @@ from splatgraft.runtime.progress import NoCheckpoint
 from splatgraft.runtime.settings import Table, from_table
 from splatgraft.steps import consolidate as tool
 from splatgraft_paper.consolidation import NoisyStartHarmonizer, PaperDescent, Schedule, descend_as_paper, noise_levels
+from splatgraft_paper.tables.harmonize_pictures import keep_pictures
 
 UPDATES_FOLDER = "updates"
 
@@ -87,7 +88,9 @@ class Consolidate(tool.Consolidate):
             update = kept / str(number)
             if harmonizer is not None and number:
                 shown = _views_of(scene, views, cameras, descent.rendering)
-                made = _kept_pictures(update, views, shown, _FromNoise(harmonizer, strength), context)
+                noisy = _FromNoise(harmonizer, strength)
+                make = partial(_again, shown, noisy)
+                made = keep_pictures(update / "images", views.stems, make, context.progress)
                 images = LazySequence(len(made), lambda index, made=made: read_rgb(made[index]).to(device))
             scene = _kept_scene(update, device, partial(fit, scene, images, again=number > 0))
         if self.updates > 1:
@@ -136,6 +139,10 @@ class _FromNoise:
         return self.harmonizer.harmonize(view)
 
 
+def _again(shown: Sequence[HarmonizerInputs], noisy: Harmonizer, index: int) -> Float[Tensor, "h w 3"]:
+    return noisy.harmonize(shown[index])
+
+
 def _kept_scene(folder: Path, device: torch.device, make: Callable[[], Gaussians]) -> Gaussians:
     """Read the scene of an update that an earlier run finished, or make and keep it."""
     path = folder / SCENE_FILE
@@ -143,19 +150,6 @@ def _kept_scene(folder: Path, device: torch.device, make: Callable[[], Gaussians
         folder.mkdir(parents=True, exist_ok=True)
         write_gaussians(path, make().to("cpu"))
     return read_gaussians(path).to(device)
-
-
-def _kept_pictures(
-    folder: Path, views: ViewFolder, shown: Sequence[HarmonizerInputs], harmonizer: Harmonizer, context: Context
-) -> list[Path]:
-    """Harmonise the views of an update that an earlier run did not, and return the files of all."""
-    paths = [folder / "images" / f"{stem}.png" for stem in views.stems]
-    (folder / "images").mkdir(parents=True, exist_ok=True)
-    for index, path in enumerate(paths):
-        if not path.is_file():
-            write_image(path, harmonizer.harmonize(shown[index]).cpu())
-        context.progress(index + 1, len(paths), f"update {folder.name}, view {index + 1}")
-    return paths
 
 
 def _views_of(

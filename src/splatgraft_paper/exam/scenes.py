@@ -27,7 +27,7 @@ from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.workers import Task, run_tasks
 from splatgraft_paper.benchmark.measure import true_view
-from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY, GroundTruthScene, compose_scene
+from splatgraft_paper.benchmark.scene import HELD_OUT_EVERY, CompositionOptions, GroundTruthScene, compose_scene
 from splatgraft_paper.benchmark.true_light import TRUE_LIGHT_FILE, read_probe, write_true_light
 from splatgraft_paper.peers.deferred_reflection import ReflectiveScene
 from splatgraft_paper.synthesis.benchmark import BenchmarkScene, BenchmarkSize, find_defect, gather, plan
@@ -126,7 +126,7 @@ class ExamScene:
 def read_scene(folder: Path, work: Path, options: ReconstructOptions, console: Console) -> ExamScene:
     """Read a rendered scene, after reconstructing and composing it in `work` if that is not done yet."""
     files = GroundTruthScene.from_folder(folder)
-    composed = compose_scene(files, work, options, device="cpu", console=console)
+    composed = compose_scene(files, work, CompositionOptions(options, "cpu"), console)
     composite = read_composite(composed.target, composed.composite / PLACEMENT_FILE)
     assert composed.surroundings is not None
     assert composed.source_cameras is not None

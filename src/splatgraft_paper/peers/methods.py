@@ -1,7 +1,10 @@
 """Peer methods of the benchmark by name, among them LBM and the colour transfer of Reinhard et al."""
 
-from dataclasses import dataclass, replace
+import hashlib
+import tomllib
+from dataclasses import dataclass
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, ClassVar
 
 import cv2
@@ -15,6 +18,7 @@ from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.harmonization import HARMONIZERS, HarmonizerContext, HarmonizerOptions
 from splatgraft.harmonization.interface import Harmonizer, HarmonizerInputs
 from splatgraft.runtime.hub import REPOSITORIES
+from splatgraft.runtime.settings import Table, field_types, from_table
 from splatgraft_paper.peers.image_editing import ImageEditingOptions
 from splatgraft_paper.peers.mv_colight import MVCoLightOptions
 
@@ -114,10 +118,44 @@ PEERS = {kind.name: kind for kind in (ReinhardOptions, LbmOptions, MVCoLightOpti
 """Options by name of the method."""
 
 
-def method_options(name: str, *, weights: str | None = None) -> HarmonizerOptions:
-    """Return the default options of a method of `HARMONIZERS` or `PEERS`; `weights` replaces its weights, if any."""
+@dataclass(frozen=True)
+class OptionWords:
+    """A method with options of its own, parsed from NAME:KEY=VALUE,KEY=VALUE."""
+
+    name: str
+    options: tuple[tuple[str, str], ...] = ()
+
+    @staticmethod
+    def parse(text: str) -> "OptionWords":
+        """Parse the name and the options; values may hold any character but a comma."""
+        name, _, rest = text.partition(":")
+        pairs = [part.partition("=") for part in rest.split(",")] if rest else []
+        if not name or not all(key and found for key, found, _ in pairs):
+            raise ValueError(f"--methods: expected NAME:KEY=VALUE,KEY=VALUE, found {text}")
+        return OptionWords(name, tuple((key.replace("-", "_"), value) for key, _, value in pairs))
+
+    @property
+    def folder_name(self) -> str:
+        """Name of a folder, which differs for other options."""
+        plain = self.name.replace("/", "-")
+        return f"{plain}-{hashlib.sha256(repr(self.options).encode()).hexdigest()[:8]}" if self.options else plain
+
+
+def named_options(words: OptionWords, *, weights: str | None = None) -> HarmonizerOptions:
+    """Return the options of a method of `HARMONIZERS` or `PEERS`; `weights` is the default of its weights, if any."""
     known = {**HARMONIZERS, **PEERS}
-    if name not in known:
-        raise ValueError(f"harmonizer: expected one of {', '.join(sorted(known))}, found {name!r}")
-    options = known[name]()
-    return replace(options, weights=weights) if weights is not None and hasattr(options, "weights") else options  # pyright: ignore
+    if words.name not in known:
+        raise ValueError(f"harmonizer: expected one of {', '.join(sorted(known))}, found {words.name!r}")
+    kind = known[words.name]
+    given: dict[str, Any] = {key: _value(text) for key, text in words.options}
+    if weights is not None and "weights" in field_types(kind):
+        given = {"weights": weights, **given}
+    return from_table(kind, Table(given, f"--methods {words.name}", Path()), {})
+
+
+def _value(text: str) -> Any:
+    """Read a number or a truth value as in TOML; anything else is text."""
+    try:
+        return tomllib.loads(f"x = {text}")["x"]
+    except tomllib.TOMLDecodeError:
+        return text

@@ -186,6 +186,14 @@ def match_views(wanted: Sequence[str], found: dict[str, Path]) -> tuple[dict[str
     return {}, f"none of {len(found)} pictures fits {len(wanted)} views, neither by name nor by number"
 
 
+def named_folders(names: tuple[str, ...]) -> dict[str, str]:
+    """Parse the words ROLE=NAME of --names."""
+    named = dict((text.partition("=")[0], text.partition("=")[2]) for text in names)
+    if not named.keys() <= NAMES.keys() or not all(named.values()):
+        raise ValueError(f"--names: expected ROLE=NAME with ROLE of {', '.join(NAMES)}, found {' '.join(names)}")
+    return named
+
+
 def _subfolders(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
 

@@ -6,26 +6,37 @@
    of its own capture is unknown then, as in the first case.
 """
 
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.images import write_image
+from splatgraft.core.images import read_rgb, write_image
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.core.similarity import Similarity
 from splatgraft.folders.capture_files import camera_files
+from splatgraft.folders.view_folder import ViewFolder
 from splatgraft.formats import read_cameras, read_gaussians, read_scene, write_cameras, write_capture, write_gaussians
-from splatgraft.project.layout import OBJECT_FILE, PLACEMENT_FILE
+from splatgraft.project.layout import METRICS_FILE, OBJECT_FILE, PLACEMENT_FILE, SCENE_FILE
 from splatgraft.project.placement import ObjectPlacement, Placement, write_placement
 from splatgraft.project.step import Context, Device, Inputs, choose_device
-from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.rendering import render
 from splatgraft.runtime.console import Console
-from splatgraft.steps.compose import Compose
+from splatgraft.steps.render import Render
+from splatgraft_paper.benchmark.measure import disagreement
 from splatgraft_paper.benchmark.methods import Method, MethodSettings, run_method
-from splatgraft_paper.benchmark.scene import ComposedScene, GroundTruthScene, compose_scene, perform_if_stale
+from splatgraft_paper.benchmark.scene import (
+    ComposedScene,
+    CompositionOptions,
+    GroundTruthScene,
+    compose_scene,
+    perform_if_stale,
+    place_step,
+)
+from splatgraft_paper.commands.consolidate import UPDATES_FOLDER
 from splatgraft_paper.tables.layout import PaperScene, held_out_stems, pictures
 
 
@@ -35,8 +46,8 @@ class OurRun:
 
     out: Path
     """Folder of all results."""
-    options: ReconstructOptions
-    """Options of the reconstruction of captures."""
+    composition: CompositionOptions
+    """Options of reconstruction and composition."""
     methods: MethodSettings = field(default_factory=MethodSettings)
 
     @property
@@ -74,17 +85,99 @@ class RenderPictures:
             context.progress(done, len(wanted), cameras.names[index])
 
 
-def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Console) -> tuple[Path, dict[str, float]]:
-    """Run a method's stale steps on a scene, and return the folder of its held-out views and seconds by step."""
-    work = run.out / "scenes" / scene.name
+@dataclass(frozen=True)
+class MeasureAgreement:
+    """Disagreement of neighbouring views of a result, and of the truth, warped by the depth of the composite."""
+
+    result: Path
+    """Scene, a .ply."""
+    views: Path
+    """Folder that `Render` wrote for the composite."""
+    truth: Path
+    """Folder of true pictures."""
+    out: Path
+    """Folder for metrics.json."""
+    device: Device = "auto"
+
+    def inputs(self) -> Inputs:
+        """List the scene, the views and the true pictures."""
+        views = ViewFolder.open(self.views).files()
+        return {"scene": (self.result,), "views": views, "truth": tuple(pictures(self.truth).values())}
+
+    def write(self, folder: Path, context: Context) -> None:
+        """Measure both."""
+        device = choose_device(self.device, context.console)
+        scene, views, given = read_gaussians(self.result).to(device), ViewFolder.open(self.views), pictures(self.truth)
+        made, true, depths, masks = {}, {}, [], []
+        for index, name in enumerate(views.cameras.names):
+            made[index] = render(scene, views.cameras[index].to(device)).color[0].cpu().clamp(0, 1)
+            if Path(name).stem in given:
+                true[index] = read_rgb(given[Path(name).stem])
+            view = views.read(index)
+            depths.append(view.depth)
+            masks.append(view.mask)
+            context.progress(index + 1, len(views), name)
+        found = {"disagreement": made, "disagreement_truth": true}
+        values = {name: disagreement(images, depths, masks, views.cameras) for name, images in found.items()}
+        known = {name: value for name, value in values.items() if value is not None}
+        (folder / METRICS_FILE).write_text(json.dumps(known if len(known) == len(found) else {}), encoding="utf-8")
+
+
+SHOWN_UPDATES = (1, 3, 5)
+"""Iterative updates whose result is pictured, as in the paper's figure."""
+
+
+def updates_folder(scene: Path, method: Method, number: int) -> Path:
+    """Return the folder of a picture after an update, in that of the scene's results."""
+    return scene / "updates" / method.folder_name / str(number)
+
+
+@dataclass(frozen=True)
+class OurPictures:
+    """A method's result on a scene."""
+
+    folder: Path
+    """Pictures of the held-out views."""
+    seconds: Mapping[str, float]
+    """Seconds by step."""
+    values: Mapping[str, float] = field(default_factory=dict)
+    """Disagreement of neighbouring views, of scenes with rotations."""
+
+
+def our_pictures(scene: PaperScene, method: Method, run: OurRun, console: Console) -> OurPictures:
+    """Run a method's stale steps on a scene."""
+    folder = run.out / "scenes" / scene.name
+    work = folder / ("" if method.pipeline == "ours" else "as_paper")
     cameras_from = _cameras_path(scene)
-    composed = _composed(scene, work, run, console)
+    composed = _composed(
+        scene, work, replace(run, composition=replace(run.composition, pipeline=method.pipeline)), console
+    )
     result, seconds = run_method(method, composed, run.methods, console)
+    if result.is_dir():
+        return OurPictures(result, {**composed.seconds, **seconds})
     names = [Path(name).stem for name in read_cameras(cameras_from).names]
     stems = tuple(held_out_stems(names))
-    out = work / "pictures" / method.folder_name
+    out = folder / "pictures" / method.folder_name
     perform_if_stale(RenderPictures(result, cameras_from, out, stems=stems, device=run.device), console)
-    return out, {**composed.seconds, **seconds}
+    for number in SHOWN_UPDATES if method.schedule != "once" else ():
+        update = result.parent / UPDATES_FOLDER / str(number - 1) / SCENE_FILE
+        shown = updates_folder(folder, method, number)
+        middle = (stems[len(stems) // 2],)
+        perform_if_stale(RenderPictures(update, cameras_from, shown, stems=middle, device=run.device), console)
+    values: Mapping[str, float] = {}
+    if scene.kind == "rotation" and "truth" in scene.folders:
+        pasted, views = (
+            composed.composite / SCENE_FILE,
+            work / "views" / ("paper" if method.pipeline == "paper" else "off"),
+        )
+        render_views = Render(
+            pasted, composed.cameras, views, is_object=composed.is_object, prior=pasted, device=run.device
+        )
+        at = folder / "agreement" / method.folder_name
+        for step in (render_views, MeasureAgreement(result, views, scene.folders["truth"], at, run.device)):
+            perform_if_stale(step, console)
+        values = json.loads((at / METRICS_FILE).read_text(encoding="utf-8"))
+    return OurPictures(out, {**composed.seconds, **seconds}, values)
 
 
 def _cameras_path(scene: PaperScene) -> Path:
@@ -101,7 +194,7 @@ def _composed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> C
     if {"source_capture", "target_capture", "placement"} <= set(files) and "truth" in scene.folders:
         captures = (files["source_capture"], files["target_capture"])
         truth = GroundTruthScene(scene.name, *captures, scene.folders["truth"], files["placement"])
-        return compose_scene(truth, work, run.options, device=run.device, console=console)
+        return compose_scene(truth, work, run.composition, console)
     if {"composite", "masks"} <= set(scene.folders) and ("background" in scene.folders or "target_capture" in files):
         return _cut_from_pictures(scene, work, run, console)
     found = [path.name for path in (*scene.folders.values(), *files.values())]
@@ -124,7 +217,7 @@ def _cut_from_pictures(scene: PaperScene, work: Path, run: OurRun, console: Cons
     target = given.get("background", scene.files.get("target_capture"))
     assert target is not None
     truth = GroundTruthScene(scene.name, given["composite"], target, target, placement)
-    composed = compose_scene(truth, work, run.options, device=run.device, console=console)
+    composed = compose_scene(truth, work, replace(run.composition, masks="given"), console)
     return replace(composed, from_capture=False)
 
 
@@ -163,8 +256,8 @@ def _placed(scene: PaperScene, work: Path, run: OurRun, console: Console) -> Com
         for note in given.notes:
             console.say(f"{scene.files[key]}: {note}")
         write_gaussians(path, given.gaussians)
-    compose = Compose(composed.target, object_file, composed.composite, placement=_placement_as_given(work))
-    perform_if_stale(compose, console)
+    placement = _placement_as_given(work)
+    perform_if_stale(place_step(run.composition.pipeline, composed, object_file, placement), console)
     return composed
 
 

@@ -3,34 +3,25 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-
-import numpy as np
 
 from splatgraft.core.flip import VERSION as FLIP_VERSION
-from splatgraft.core.images import read_rgb
 from splatgraft.fitting.perceptual_losses import HEADS_FILE, VGG_FILE
 from splatgraft.project.layout import METRICS_FILE
 from splatgraft.runtime.console import Console
-from splatgraft_paper.benchmark.image_features import (
-    INCEPTION_FILE,
-    Features,
-    frechet_distance,
-    inception_features,
-    kernel_distance,
-)
+from splatgraft_paper.benchmark.image_features import INCEPTION_FILE
 from splatgraft_paper.benchmark.methods import Method
 from splatgraft_paper.benchmark.scene import perform_if_stale
+from splatgraft_paper.tables.data_ablation import MeasuredModels
 from splatgraft_paper.tables.layout import Kind, PaperScene
-from splatgraft_paper.tables.measure_pictures import MeasurePictures
-from splatgraft_paper.tables.our_pictures import OurRun, our_pictures
+from splatgraft_paper.tables.measure_pictures import MeasurePictures, MetricOptions, pooled_distances
+from splatgraft_paper.tables.our_pictures import OurPictures, OurRun, our_pictures
 
 METRIC_VERSIONS = {
     "psnr": "whole images, peak 1, mean over views, then over scenes",
     "ssim": "Wang 2004, 11x11 Gaussian window, zeros beyond the border, as 3DGS's metrics.py",
     "flip": FLIP_VERSION,
-    "lpips": f"Zhang 2018, version 0.1, VGG-16 ({VGG_FILE}, {HEADS_FILE}), pictures scaled to [-1, 1] as published "
-    "(3DGS's metrics.py gives the network [0, 1]; which of the two the paper used is not said)",
+    "lpips": f"Zhang 2018, version 0.1, VGG-16 ({VGG_FILE}, {HEADS_FILE}), pictures scaled to [-1, 1] as published",
+    "lpips01": "likewise, pictures in [0, 1] as in 3DGS's metrics.py; the paper does not say which of the two it used",
     "fid": f"Heusel 2017, pooled over the measured views of all scenes, {INCEPTION_FILE}",
     "kid": f"Binkowski 2018, likewise, subsets of 50, {INCEPTION_FILE}",
 }
@@ -60,16 +51,18 @@ class PaperResults:
     """Reasons for missing measurements by (scene, method)."""
     not_measured: Mapping[str, str]
     """Reasons for missing weights by metric ("lpips", "fid and kid")."""
-    ours: tuple[str, ...] = ()
-    """Names of our methods, in order."""
+    ours: Mapping[str, str] = field(default_factory=dict)
+    """Names of our methods, in order, and of their folders."""
     pooled: Mapping[tuple[Kind, str, str], Mapping[str, float]] = field(default_factory=dict)
     """FID and KID by (kind, pose or "", method)."""
-    by_model: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """Metrics on each source's test split, such as `psnr Blender`, by trained model."""
+    by_model: MeasuredModels = field(default_factory=lambda: MeasuredModels({}))
+    """Metrics of the trained models on each source's test split."""
     stand_ins: frozenset[str] = frozenset()
     """Metrics whose weights are not the published ones."""
     device: str = ""
     """Name of the device on which our methods ran."""
+    conditions: str = ""
+    """Quality, segmentation, weights, device and commit of the rows that were run here."""
 
     def methods(self, kind: Kind) -> list[str]:
         """List the methods with pictures of scenes of a kind, the authors' first."""
@@ -80,20 +73,6 @@ class PaperResults:
         """Select the measurements of a method on the scenes of a kind, optionally at one pose."""
         chosen = [item for item in self.measured if item.scene.kind == kind and item.method == method]
         return [item for item in chosen if pose in ("", item.scene.pose)]
-
-
-def pooled_distances(
-    steps: Mapping[tuple[Kind, str, str], list[MeasurePictures]], features: Features
-) -> dict[tuple[Kind, str, str], dict[str, float]]:
-    """Compute FID and KID between a method's pictures of all its scenes and the true pictures."""
-    out: dict[tuple[Kind, str, str], dict[str, float]] = {}
-    for key, group in steps.items():
-        chosen = [step.views().files for step in group]
-        paths = {role: [path for files in chosen for path in files[role].values()] for role in ("pictures", "truth")}
-        if len(paths["truth"]) >= 2:
-            found, wanted = (np.concatenate([features([read_rgb(path)]) for path in one]) for one in paths.values())
-            out[key] = {"fid": frechet_distance(found, wanted), "kid": kernel_distance(found, wanted)}
-    return out
 
 
 COMPOSITE = "Composite"
@@ -118,7 +97,7 @@ class PaperRun:
 class _Found:
     """Results so far of a running run."""
 
-    lpips: bool
+    metrics: MetricOptions
     console: Console
     measured: list[Measured] = field(default_factory=list)
     missing: dict[tuple[str, str], str] = field(default_factory=dict)
@@ -127,7 +106,9 @@ class _Found:
 
 def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: Console) -> PaperResults:
     """Measure and run what is missing, except for the models of the data ablation."""
-    found = _Found("lpips" not in not_measured, console)
+    weights = run.ours.methods.weights
+    metrics = MetricOptions(weights, "lpips" not in not_measured, "fid and kid" not in not_measured, run.ours.device)
+    found = _Found(metrics, console)
     for scene in run.scenes:
         if scene.lacks:
             found.missing[scene.name, "ground truth"] = scene.lacks
@@ -135,7 +116,7 @@ def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: C
         theirs = {**({} if composite is None else {COMPOSITE: composite}), **scene.results}
         for method, folder in theirs.items():
             try:
-                _measure(run, scene, method, folder, found)
+                _measure(run, scene, method, OurPictures(folder, {}), found)
             except ValueError as error:
                 found.missing[scene.name, method] = str(error)
         for method in run.methods:
@@ -143,33 +124,31 @@ def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: C
                 found.missing[scene.name, method.name] = "--measure-only: nothing was run"
             else:
                 _run_ours(run, scene, method, found)
-    pooled = {}
-    if "fid and kid" not in not_measured:
-        pooled = pooled_distances(found.pools, inception_features(run.ours.methods.weights))
-    names = tuple(method.name for method in run.methods)
+    names = {method.name: method.folder_name for method in run.methods}
+    pooled = pooled_distances(found.pools)
     return PaperResults(run.scenes, tuple(found.measured), found.missing, not_measured, names, pooled)
 
 
 def _run_ours(run: PaperRun, scene: PaperScene, method: Method, found: _Found) -> None:
     """Run a method on a scene and measure it; record the reason if it cannot run."""
     try:
-        folder, seconds = our_pictures(scene, method, run.ours, found.console)
-        _measure(run, scene, method.name, folder, found, seconds)
+        made = our_pictures(scene, method, run.ours, found.console)
+        _measure(run, scene, method.name, made, found)
     except (ValueError, ModuleNotFoundError) as error:
         found.missing[scene.name, method.name] = " ".join(str(error).split())
 
 
-def _measure(
-    run: PaperRun, scene: PaperScene, method: str, folder: Path, found: _Found, seconds: Mapping[str, float] = {}
-) -> None:
+def _measure(run: PaperRun, scene: PaperScene, method: str, made: OurPictures, found: _Found) -> None:
     """Measure pictures of a scene whose truth is known."""
     if "truth" not in scene.folders:
         return
-    out = run.ours.out / "measured" / scene.name / method.replace("/", "-")
-    truth, weights = scene.folders["truth"], run.ours.methods.weights
-    step = MeasurePictures(folder, truth, out, weights, found.lpips, run.all_views)
+    named = {one.name: one.folder_name for one in run.methods}
+    out = run.ours.out / "measured" / scene.name / named.get(method, method.replace("/", "-"))
+    step = MeasurePictures(made.folder, scene.folders["truth"], out, found.metrics, run.all_views)
     perform_if_stale(step, found.console)
     record = json.loads((out / METRICS_FILE).read_text(encoding="utf-8"))
-    found.measured.append(Measured(scene, method, record["values"], record["protocol"], seconds))
+    found.measured.append(
+        Measured(scene, method, {**record["values"], **made.values}, record["protocol"], made.seconds)
+    )
     for pose in {"", scene.pose}:
         found.pools.setdefault((scene.kind, pose, method), []).append(step)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,16 +19,18 @@ from splatgraft.harmonization.flux.loading import (
     widen_transformer,
 )
 from splatgraft.harmonization.flux.network import FirstLayer, Variant, velocity
-from splatgraft.harmonization.flux.prompt import find_prompt, read_prompt
+from splatgraft.harmonization.flux.prompt import TOKENS, find_prompt, read_prompt
 from splatgraft.harmonization.flux.sampling import noise, noisy, sample, schnell_levels
 from splatgraft.harmonization.flux.tensor_file import write_tensors
 from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.hub import hub_id
+from splatgraft_paper.synthesis.jobs import parse_image_size
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, Objective, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, TrainingData, crop_pair_to_size, open_training_data
-from splatgraft_paper.training.recipes import Recipe, say_plan
+from splatgraft_paper.training.recipes import Recipe, TrainingMemory, say_plan
 from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 
 Times = Literal["uniform", "schnell"]
@@ -179,11 +181,20 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
     """Train a harmoniser and return its folder; None in all but the first process, or if only the plan is printed."""
     recipe = Recipe.read(options.recipe) if options.recipe else None
     processes = join_processes(options.loop)
-    if options.plan or recipe:
-        say_plan(recipe, options.loop, options.data.size, processes, console)
-        if options.plan:
-            return None
-    data = open_training_data(options.data, options.loop.seed, recipe)
+    loop, count = options.loop, processes.num_processes
+    if options.plan and recipe and count == 1 and not loop.cpu:
+        # without a launcher the plan is for the GPUs here, or else for the recipe's number
+        count = torch.cuda.device_count() or recipe.processes
+    elif not options.plan:
+        loop = replace(loop, cpu=processes.device.type == "cpu")
+    if processes.is_main_process and (options.plan or recipe):
+        say_plan(recipe, loop, options.data.size, count, console)
+    loop.check(count)
+    data = None if options.plan else open_training_data(options.data, options.loop.seed, recipe)
+    if processes.is_main_process and options.base != TINY:
+        training_memory(options, loop, count).say_and_check(loop, count, out, console)
+    if data is None:
+        return None
     folder = out / "base"
     if options.base != TINY:
         folder = local_folder(options.base, console.say)
@@ -192,6 +203,24 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
     processes.wait_for_everyone()
     objective = FluxObjective(folder, options, console.say)
     return train_objective(objective, data, out, options.loop, base=folder, console=console)
+
+
+def training_memory(options: FluxTrainingOptions, loop: LoopOptions, processes: int) -> TrainingMemory:
+    """Compute the memory of a training from the tensors of its network, none of which is made.
+
+    A base that is not on this machine counts as FLUX.1-schnell.
+    """
+    kind, folder = diffusers_library().FluxTransformer2DModel, Path(hub_id(options.base))
+    width, height = parse_image_size(options.data.size, multiple_of=16)
+    with torch.device("meta"):
+        network = kind.from_config(FluxFolder.open(folder).config) if folder.is_dir() else kind()
+        if network.config.in_channels == network.out_channels:
+            widen_transformer(network)
+        if options.lora:
+            add_lora(network.to(torch.bfloat16 if loop.precision == "bf16" else torch.float32), options.lora, seed=0)
+    per_pass = max(1, loop.batch // (processes * loop.accumulate))
+    tokens = per_pass * (width * height // 256 + TOKENS) * network.inner_dim
+    return TrainingMemory.of(network, loop, processes, tokens=tokens, checkpointing=not options.no_checkpointing)
 
 
 def _make_tiny_base(folder: Path, data: TrainingData, seed: int, console: Console) -> None:

@@ -355,7 +355,8 @@ class _Loop:
         options = StateDictOptions(full_state_dict=True, cpu_offload=True, ignore_frozen_params=True)
         with self._averaged():
             state: dict[str, Any] = get_model_state_dict(self._network, options=options)
-            state = {name: tensor.detach().clone() for name, tensor in state.items()}
+            # one at a time, because FLUX's weights twice are 95 GB
+            state = {name: state.pop(name).detach().clone() for name in list(state)}
         self._processes.wait_for_everyone()
         return state if self.is_first else {}
 

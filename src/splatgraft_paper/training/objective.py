@@ -22,7 +22,7 @@ from splatgraft.project.step import locked
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_folder
 from splatgraft_paper.training.loop import LoopOptions, Validation, join_processes, train
-from splatgraft_paper.training.pairs import PairFiles, Role, TrainingData, crop_pair_to_size
+from splatgraft_paper.training.pairs import PairFiles, Role, TrainingData, crop_pair_to_size, write_split
 
 MODEL_FOLDER = "model"
 Latents = Mapping[str, Tensor]
@@ -230,6 +230,7 @@ def train_objective(
         state = train(task, options, out, say=say, progress=progress)
         if first:
             objective.save(state, out / MODEL_FOLDER)
+            write_split(out / MODEL_FOLDER, data.split)
     processes.wait_for_everyone()
     return out / MODEL_FOLDER if first else None
 

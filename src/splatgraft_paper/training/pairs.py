@@ -12,7 +12,7 @@ import hashlib
 import json
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +29,8 @@ from splatgraft_paper.training.recipes import Recipe
 Role = Literal["composite", "target", "background", "mask"]
 MANIFEST_FILE = "manifest.jsonl"
 RECORD_FILE = "record.json"
+SPLIT_FILE = "split.json"
+"""File beside a model's weights that names the groups of pairs it was trained on, and those held out."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,16 @@ class PairFolder:
     name: str
     """Path of the folder, which is part of a training's fingerprint."""
     pairs: tuple[PairFiles, ...]
+
+    @property
+    def groups(self) -> frozenset[str]:
+        """Groups of all pairs."""
+        return frozenset(pair.group for pair in self.pairs)
+
+
+def open_source(option: str, folders: Sequence[str]) -> list[PairFolder]:
+    """Open the folders of one source, which its option names: pairs, generated or orida."""
+    return [open_rendered(Path(folder)) if option == "pairs" else open_relit(Path(folder)) for folder in folders]
 
 
 def open_rendered(folder: Path) -> PairFolder:
@@ -211,6 +223,13 @@ class Mixture:
         return [pair for _, pair in sorted(numbered, key=lambda entry: entry[0])]
 
 
+def held_out_groups(folder: PairFolder, share: float) -> frozenset[str]:
+    """Choose the groups of a folder that are held out, the first in the order of their names' hashes."""
+    groups = sorted(folder.groups, key=lambda group: hashlib.sha256(group.encode()).hexdigest())
+    count = max(1, round(share * len(groups))) if share > 0 and len(groups) > 1 else 0
+    return frozenset(groups[:count])
+
+
 def split_mixture(
     folders: Sequence[PairFolder], *, weights: Sequence[float], held_out: float, seed: int
 ) -> tuple[Mixture, Mixture | None]:
@@ -232,9 +251,7 @@ def split_mixture(
         raise ValueError(f"--weights: expected {len(folders)} numbers of at least 0, found {list(weights)}")
     training, validation = [], []
     for folder in folders:
-        groups = sorted({pair.group for pair in folder.pairs}, key=lambda g: hashlib.sha256(g.encode()).hexdigest())
-        count = max(1, round(held_out * len(groups))) if held_out > 0 and len(groups) > 1 else 0
-        excluded = set(groups[:count])
+        excluded = held_out_groups(folder, held_out)
         training.append(tuple(pair for pair in folder.pairs if pair.group not in excluded))
         validation.append(tuple(pair for pair in folder.pairs if pair.group in excluded))
     names, shares = tuple(folder.name for folder in folders), tuple(weights)
@@ -264,6 +281,30 @@ class DataOptions:
     """Share of the scenes for validation, which are never trained on."""
 
 
+Split = Mapping[str, Sequence[Mapping[str, Sequence[str]]]]
+"""Names of the groups `trained` on and `held_out`, of each folder of a source, by the source's option."""
+
+
+def write_split(folder: Path, split: Split) -> None:
+    """Write which groups a training used and held out beside its weights."""
+    with atomic_write(folder / SPLIT_FILE) as stream:
+        stream.write((json.dumps(split, indent=1) + "\n").encode())
+
+
+def read_split(folder: Path) -> Split | None:
+    """Read the groups that a training used and held out; None without a record, as beside other authors' weights."""
+    path = folder / SPLIT_FILE
+    if not path.is_file():
+        return None
+    try:
+        found: Split = json.loads(path.read_text(encoding="utf-8"))
+        return {
+            name: [{"trained": one["trained"], "held_out": one["held_out"]} for one in found[name]] for name in found
+        }
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected the groups of a training, found {type(error).__name__}: {error}") from error
+
+
 @dataclass(frozen=True)
 class TrainingData:
     """Pairs of the opened folders, split by whole scenes."""
@@ -277,6 +318,8 @@ class TrainingData:
     """Pixels."""
     lines: tuple[str, ...] = ()
     """One line of text per folder: its number of training pairs, and its share of the drawn pairs."""
+    split: "Split" = field(default_factory=dict)
+    """Groups of each folder."""
 
 
 def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -> TrainingData:
@@ -290,11 +333,8 @@ def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -
     counts = {name: len(folders) for name, folders in given.items()}
     chosen = recipe or Recipe.read("paper").for_folders(counts)
     weights = options.weights or chosen.weights(counts)
-    folders = [
-        open_rendered(Path(folder)) if name == "pairs" else open_relit(Path(folder))
-        for name, listed in given.items()
-        for folder in listed
-    ]
+    opened = {name: open_source(name, listed) for name, listed in given.items() if listed}
+    folders = [folder for listed in opened.values() for folder in listed]
     if not folders:
         raise ValueError("training data: expected --pairs, --generated or --orida, found none")
     mixture, held_out = split_mixture(folders, weights=weights, held_out=options.held_out, seed=seed)
@@ -303,4 +343,10 @@ def open_training_data(options: DataOptions, seed: int, recipe: Recipe | None) -
         f"{share / sum(weights):.0%} of the drawn pairs"
         for folder, own, share in zip(folders, mixture.pairs, weights, strict=True)
     ]
-    return TrainingData(mixture, held_out, width, height, tuple(lines))
+    split = {name: [_split_of(folder, options.held_out) for folder in listed] for name, listed in opened.items()}
+    return TrainingData(mixture, held_out, width, height, tuple(lines), split)
+
+
+def _split_of(folder: PairFolder, share: float) -> dict[str, list[str]]:
+    held_out = held_out_groups(folder, share)
+    return {"trained": sorted(folder.groups - held_out), "held_out": sorted(held_out)}

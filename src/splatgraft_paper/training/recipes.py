@@ -1,11 +1,16 @@
 """Recipes of trainings: the paper's experiments as TOML, their command-line options, and the plan of a training."""
 
 import argparse
+import shutil
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from splatgraft.reconstruction.options import available_memory
 from splatgraft.runtime.console import Console
 from splatgraft_paper.training.loop import LoopOptions
 
@@ -75,16 +80,6 @@ class Recipe:
         licences = {key: text for key, text in self.licences.items() if key not in dropped}
         return replace(self, name=name, title=title, sources=sources, licences=licences)
 
-    def words(self) -> list[str]:
-        """Convert the options to command-line arguments, which later arguments replace."""
-        words = []
-        for name, value in self.options.items():
-            if value is True:
-                words.append(f"--{name}")
-            elif value is not False:
-                words += [f"--{name}", str(value)]
-        return words
-
     def for_folders(self, folders: dict[str, int]) -> "Recipe":
         """Drop the sources without folders."""
         return replace(self, sources=tuple(source for source in self.sources if folders.get(source.option)))
@@ -101,15 +96,12 @@ class Recipe:
         return tuple(share for folder in shares for share in folder)
 
 
-def say_plan(recipe: Recipe | None, loop: LoopOptions, size: str, processes: Any, console: Console) -> None:
-    """Print the plan of a training: steps, size and GPUs; with a recipe, also data and licences.
-
-    `processes` is accelerate's Accelerator; without a launcher, the plan is for the recipe's number of processes.
-    """
-    if not processes.is_main_process:
-        return
-    count = recipe.processes if recipe and processes.num_processes == 1 else processes.num_processes
-    lines = [f"plan: {loop.steps:,} steps of {loop.batch} pairs at {size}, Adam at {loop.rate:g}, on {count} GPUs"]
+def say_plan(recipe: Recipe | None, loop: LoopOptions, size: str, processes: int, console: Console) -> None:
+    """Print the plan of a training: steps, size and processes; with a recipe, also data and licences."""
+    place = "processes on the CPU" if loop.cpu else "GPUs"
+    lines = [
+        f"plan: {loop.steps:,} steps of {loop.batch} pairs at {size}, Adam at {loop.rate:g}, on {processes} {place}"
+    ]
     if recipe is not None:
         lines.insert(0, f"recipe {recipe.name}: {recipe.title}")
         total = sum(source.weight for source in recipe.sources)
@@ -120,6 +112,92 @@ def say_plan(recipe: Recipe | None, loop: LoopOptions, size: str, processes: Any
         lines += [f"licence: {name}: {licence}" for name, licence in recipe.licences.items()]
     for line in lines:
         console.say(line)
+
+
+def option_words(options: Mapping[str, Any]) -> list[str]:
+    """Convert options of a table to command-line arguments, which later arguments replace."""
+    words: list[str] = []
+    for name, value in options.items():
+        if value is not False:
+            values = value if isinstance(value, list) else [] if value is True else [value]
+            words += [f"--{name}", *map(str, values)]
+    return words
+
+
+_STATES = 3  # two states are kept while a third is written
+_RESERVED_BYTES = 2e9  # estimate for the autoencoder, libraries, the CUDA context and fragmentation
+_GATHERED = 3  # blocks that are whole at once in shards: weights of two, because the next is fetched, and gradients
+_COPIES = 40  # 16-bit copies of a block's tokens that its backward pass needs, as `working_bytes` of inference counts
+
+
+@dataclass(frozen=True)
+class TrainingMemory:
+    """Memory and disk that a training needs, bytes; what depends on activations is an estimate."""
+
+    state: int
+    """Weights, gradients, both moments of Adam and the average, over all processes that share them."""
+    device: float
+    """On each GPU, or in each process on the CPU."""
+    host: float
+    """Of a machine whose processes all load the weights at once."""
+    disk: float
+    """States and model at the most, without latents."""
+
+    @staticmethod
+    def of(network: Any, loop: LoopOptions, processes: int, *, tokens: int, checkpointing: bool) -> "TrainingMemory":
+        """Count the bytes of a network's tensors, which may be on torch's meta device.
+
+        Args:
+            network: Network, whose trained parameters require gradients.
+            loop: Options of the training.
+            processes: Number of processes, all on one machine.
+            tokens: Positions of a block of the network, times their channels, of one pass.
+            checkpointing: Whether activations within a block are computed twice instead of kept.
+        """
+        trained = sum(p.numel() for p in network.parameters() if p.requires_grad)
+        frozen = sum(p.nbytes for p in network.parameters() if not p.requires_grad)
+        weights, copies = 4 * trained + frozen, 5 if loop.ema else 4
+        blocks = [block for part in network.children() if isinstance(part, torch.nn.ModuleList) for block in part]
+        in_shards = loop.parallel == "shards" and processes > 1
+        largest = max((sum(p.numel() for p in block.parameters()) for block in blocks), default=0)
+        divisor, gathered = (processes, 4 * largest * _GATHERED) if in_shards else (1, 0)
+        # autocast keeps 16-bit copies of the trained weights during a forward pass, when there are no gradients yet
+        half = 2 * trained if loop.precision == "bf16" else 0
+        forward = (4 * trained * (copies - 1) + frozen) / divisor + half
+        backward = (4 * trained * copies + frozen) / divisor
+        activations = len(blocks) * tokens * 4 + _COPIES * tokens * 2 * (1 if checkpointing else len(blocks))
+        device = max(weights, max(forward, backward) + gathered + activations) + _RESERVED_BYTES
+        disk = _STATES * 4 * trained * (copies - 1) + 4 * trained
+        return TrainingMemory(4 * trained * copies, device, processes * (device if loop.cpu else weights), disk)
+
+    def say_and_check(self, loop: LoopOptions, processes: int, out: Path, console: Console) -> None:
+        """Print the needs; raise a ValueError if this machine has less, as far as it has such devices."""
+        place = "process on the CPU" if loop.cpu else "GPU"
+        held = "in shards" if loop.parallel == "shards" and processes > 1 else "a copy of all weights in each"
+        console.say(
+            f"memory: about {self.device / 1e9:,.1f} GB on each {place} ({processes}, {held}), "
+            f"{self.host / 1e9:,.1f} GB of the machine, {self.disk / 1e9:,.1f} GB of disk for states and model"
+        )
+        if not (loop.cpu or torch.cuda.is_available()):
+            console.say("memory: not compared, because this machine has no GPU")
+            return
+        there = out.resolve()
+        while not there.exists():
+            there = there.parent
+        # states that exist already are replaced
+        existing = sum(path.stat().st_size for path in out.rglob("*.distcp"))
+        found: dict[str, float | None] = {
+            "disk": shutil.disk_usage(there).free + existing,
+            "host": available_memory("cpu"),
+            "device": None if loop.cpu else torch.cuda.get_device_properties(0).total_memory,
+        }
+        places = {"device": "on each GPU", "host": "of the machine's memory", "disk": f"of disk at {there}"}
+        for name, free in found.items():
+            if free is not None and getattr(self, name) > free:
+                raise ValueError(
+                    f"training: expected about {getattr(self, name) / 1e9:,.1f} GB {places[name]}, found "
+                    f"{free / 1e9:,.1f} GB; try --parallel shards on more GPUs (torchrun), or --lora"
+                )
 
 
 def arguments_with_recipe(command: str, words: list[str]) -> list[str]:
@@ -134,4 +212,4 @@ def arguments_with_recipe(command: str, words: list[str]) -> list[str]:
         found = (Recipe.read(path.stem) for path in sorted(_FOLDER.glob("*.toml")))
         known = ", ".join(one.name for one in found if one.command == command)
         raise ValueError(f"--recipe: expected a recipe of `{command}` ({known}), found {name} of `{recipe.command}`")
-    return [*recipe.words(), *words]
+    return [*option_words(recipe.options), *words]

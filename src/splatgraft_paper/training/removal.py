@@ -4,7 +4,7 @@ The UNet's first layer is widened to the noisy latent and the latents of image a
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,12 @@ from splatgraft.harmonization.flux.prompt import find_prompt
 from splatgraft.harmonization.flux.sampling import noise
 from splatgraft.harmonization.flux.tensor_file import read_tensors
 from splatgraft.runtime.console import Console
+from splatgraft.runtime.hub import hub_id
+from splatgraft_paper.synthesis.jobs import parse_image_size
 from splatgraft_paper.training.loop import LoopOptions, join_processes
 from splatgraft_paper.training.objective import Latents, Network, Objective, train_objective
 from splatgraft_paper.training.pairs import DataOptions, Role, open_training_data
-from splatgraft_paper.training.recipes import Recipe, say_plan
+from splatgraft_paper.training.recipes import Recipe, TrainingMemory, say_plan
 
 CONDITIONS = 2
 """Number of images that condition the network: the image with the object, and the mask."""
@@ -161,10 +163,39 @@ class ObjectRemover:
 def train_removal(out: Path, options: RemovalTrainingOptions, console: Console) -> Path | None:
     """Train the object removal, return its folder; None in all but the first process, or if only planned."""
     loop, recipe = options.loop, Recipe.read(options.recipe) if options.recipe else None
-    if options.plan or recipe:
-        say_plan(recipe, loop, options.data.size, join_processes(loop), console)
-        if options.plan:
-            return None
-    data = open_training_data(options.data, loop.seed, recipe)
+    processes = join_processes(loop)
+    shown, first = (
+        loop if options.plan else replace(loop, cpu=processes.device.type == "cpu"),
+        processes.is_main_process,
+    )
+    if first and (options.plan or recipe):
+        say_plan(recipe, shown, options.data.size, processes.num_processes, console)
+    data = None if options.plan else open_training_data(options.data, loop.seed, recipe)
+    if first:
+        memory = training_memory(options, shown, processes.num_processes)
+        memory.say_and_check(shown, processes.num_processes, out, console)
+    if data is None:
+        return None
     objective = RemovalObjective(options.base, console.say, checkpointing=not options.no_checkpointing)
     return train_objective(objective, data, out, loop, base=objective.folder, console=console)
+
+
+# the config.json of Stable Diffusion 2's UNet, where it differs from the defaults of diffusers
+_STABLE_DIFFUSION_2 = {
+    "cross_attention_dim": 1024,
+    "attention_head_dim": (5, 10, 20, 20),
+    "use_linear_projection": True,
+    "in_channels": 4 * (CONDITIONS + 1),
+}
+
+
+def training_memory(options: RemovalTrainingOptions, loop: LoopOptions, processes: int) -> TrainingMemory:
+    """Compute the memory of a training; a base that is not on this machine counts as Stable Diffusion 2."""
+    kind, folder = diffusers_library().UNet2DConditionModel, Path(hub_id(options.base))
+    width, height = parse_image_size(options.data.size, multiple_of=16)
+    with torch.device("meta"):
+        file = folder / "unet" / "config.json"
+        network = kind.from_config(read_config(file, kind.__name__)) if folder.is_dir() else kind(**_STABLE_DIFFUSION_2)
+    per_pass = max(1, loop.batch // (processes * loop.accumulate))
+    tokens = per_pass * (width // 8) * (height // 8) * network.config.block_out_channels[0]
+    return TrainingMemory.of(network, loop, processes, tokens=tokens, checkpointing=not options.no_checkpointing)
