@@ -101,3 +101,17 @@ def empty(sh_degree: int = 0) -> Gaussians:
         opacity_logits=torch.zeros(0),
         sh=torch.zeros(0, spherical_harmonics.coefficient_count(sh_degree), 3),
     )
+
+
+@dataclass(frozen=True)
+class KnownSurface(Gaussians):
+    """Gaussians on a surface of known shape and material, such as a mesh's; their colour is the surface's albedo."""
+
+    normals: Float[Tensor, "n 3"]
+    """Unit, outward; in the frame of the means."""
+    metallic: Float[Tensor, "n"]
+    """Share of metal, in [0, 1]; the albedo is then the colour of reflections."""
+    roughness: Float[Tensor, "n"]
+    """Perceptual roughness, in [0, 1]; its square is GGX's alpha."""
+    emission: Float[Tensor, "n 3"]
+    """Emitted linear rgb; white is 1."""

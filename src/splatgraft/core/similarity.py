@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, KnownSurface
 from splatgraft.core.rotations import quaternion_from_rotation
 
 
@@ -52,6 +52,8 @@ class Similarity:
         if self.is_identity:
             return gaussians
         rotation = self.rotation.to(gaussians.means)
+        if isinstance(gaussians, KnownSurface):
+            gaussians = replace(gaussians, normals=gaussians.normals @ rotation.T)
         return replace(
             gaussians,
             means=self.points(gaussians.means),

@@ -1,19 +1,23 @@
-"""Reading and writing of scenes, captures and cameras; the suffix, or the files in a folder, give the format."""
+"""Reading and writing of scenes, captures and cameras; the suffix, or the files in a folder, give the format.
+"""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.mesh_sampling import DEFAULT_BUDGET
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures import read_capture_file
 from splatgraft.formats.captures.transforms_json import write_cameras, write_capture
 from splatgraft.formats.captures.views import ViewRecord, cameras, posed_images
+from splatgraft.formats.meshes import read_gltf, read_ply, read_polygon_file
 from splatgraft.formats.parsing import parsing
 from splatgraft.formats.scenes.axes import with_axes
 from splatgraft.formats.scenes.compressed_ply import COMPRESSED_PLY, write_compressed_ply
-from splatgraft.formats.scenes.gaussian_glb import read_gaussian_glb, write_gaussian_glb
-from splatgraft.formats.scenes.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from splatgraft.formats.scenes.gaussian_glb import write_gaussian_glb
+from splatgraft.formats.scenes.gaussian_ply import write_gaussian_ply
 from splatgraft.formats.scenes.ksplat import read_ksplat
 from splatgraft.formats.scenes.ply import read_points, write_points
 from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
@@ -43,13 +47,18 @@ __all__ = [
 ]
 
 
-_READERS = {
-    ".ply": read_gaussian_ply,
+_READERS: dict[str, Callable[[Path], SceneFile]] = {
     ".spz": read_spz,
     ".splat": read_splat,
     ".sog": read_sog,
-    ".glb": read_gaussian_glb,
     ".ksplat": read_ksplat,
+}
+_MESH_READERS = {
+    ".ply": read_ply,
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".obj": read_polygon_file,
+    ".stl": read_polygon_file,
 }
 _WRITERS = {
     ".ply": write_gaussian_ply,
@@ -60,16 +69,17 @@ _WRITERS = {
     ".glb": write_gaussian_glb,
 }
 
-SCENE_SUFFIXES = tuple(_READERS)
-"""Suffixes of trained scenes that can be read; a folder of SOG images has none."""
+SCENE_SUFFIXES = (*_READERS, *_MESH_READERS)
+"""Suffixes of trained scenes and meshes that can be read; a folder of SOG images has none."""
 
 WRITTEN_SCENE_SUFFIXES = tuple(_WRITERS)
 """Suffixes of scenes that can be written."""
 
 
 def is_scene(path: Path) -> bool:
-    """Whether the suffix is that of a trained scene, or the path is a folder of SOG images or its meta.json."""
-    return path.suffix.lower() in _READERS or is_sog_folder(path)
+    """Whether the suffix is that of a trained scene or a mesh, or the path is a folder of SOG images or its
+    meta.json."""
+    return path.suffix.lower() in SCENE_SUFFIXES or is_sog_folder(path)
 
 
 def scene_files(path: Path) -> tuple[Path, ...]:
@@ -78,14 +88,15 @@ def scene_files(path: Path) -> tuple[Path, ...]:
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
-    """Read a trained scene.
+    """Read a trained scene, or a mesh.
 
     Args:
         path: A .ply (of 3DGS, or SuperSplat's compressed form), .spz, .splat, .sog, .glb or .ksplat file, or a folder
-            of SOG images.
+            of SOG images; or a mesh: .glb, .gltf, .obj, .stl or .ply.
 
     Returns:
-        The Gaussians in the file's order; the axes of other formats are turned to those of a .ply.
+        The Gaussians in the file's order, or those of a mesh as a `KnownSurface`; other axes are turned to those of
+        a .ply.
 
     Raises:
         ValueError: The suffix is not supported, or the file does not match its suffix.
@@ -93,23 +104,25 @@ def read_gaussians(path: Path | str) -> Gaussians:
     return _read(Path(path)).gaussians
 
 
-def read_scene(path: Path | str, *, axes: str | None = None) -> SceneFile:
-    """Read a trained scene of another program, with the up direction and size that the file states.
+def read_scene(path: Path | str, *, axes: str | None = None, mesh_budget: int = DEFAULT_BUDGET) -> SceneFile:
+    """Read a trained scene of another program, or a mesh, with the up direction and size that the file states.
 
     `axes` are the directions of the file's x, y and z, such as RDF or RUB, if they differ from the format's.
+    `mesh_budget` is the largest number of Gaussians that cover a mesh.
     """
-    scene = _read(Path(path))
+    scene = _read(Path(path), mesh_budget)
     return scene if axes is None else with_axes(scene, axes)
 
 
-def _read(path: Path) -> SceneFile:
+def _read(path: Path, mesh_budget: int = DEFAULT_BUDGET) -> SceneFile:
     with parsing(path):
-        read = read_sog if is_sog_folder(path) else _by_suffix(path, _READERS)
+        meshes = {suffix: partial(read, budget=mesh_budget) for suffix, read in _MESH_READERS.items()}
+        read = read_sog if is_sog_folder(path) else _by_suffix(path, _READERS | meshes)
         if not path.exists():
             raise ValueError("expected a trained scene, found none")
         scene = read(path)
         shapes = [tuple(field.shape) for field in vars(scene.gaussians).values()]
-        if len({shape[0] for shape in shapes}) > 1 or shapes[-1][1] not in (1, 4, 9, 16):
+        if len({shape[0] for shape in shapes}) > 1 or scene.gaussians.sh.shape[1] not in (1, 4, 9, 16):
             raise ValueError(f"expected fields of one length, and 1, 4, 9 or 16 SH coefficients, found {shapes}")
     return scene
 

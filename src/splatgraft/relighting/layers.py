@@ -9,7 +9,7 @@ from torch import Tensor
 
 from splatgraft.compositing.composite import Composite
 from splatgraft.core import spherical_harmonics
-from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.gaussians import Gaussians, KnownSurface, concatenate
 from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
 from splatgraft.core.splitting import split_wide_around
 from splatgraft.relighting.cast_shadows import Shadows
@@ -257,7 +257,8 @@ def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Ten
     source = one.source_lighting
     if source is None:
         return _Shading(received, unknown_origin_ratio(received, opacities), None)
-    settings = KNOWN_LIGHTS if scene.estimate is None and source.estimate is None else ShadeSettings()
+    is_known = isinstance(one.gaussians, KnownSurface) or scene.estimate is None
+    settings = KNOWN_LIGHTS if is_known and source.estimate is None else ShadeSettings()
     shade = shade_ratio(received, source.irradiance, opacities, settings=settings)
     if not bool(source.materials.glossy.any()):
         return _Shading(received, shade, None)

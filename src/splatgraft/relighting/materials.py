@@ -18,7 +18,7 @@ from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
 from splatgraft.core.directions import even_directions
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, KnownSurface
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.k_means import k_means
 from splatgraft.relighting.light.light import Light
@@ -116,17 +116,39 @@ class Materials:
     """Linear rgb under the old light, without the lobe."""
     share: Float[Tensor, "n"]
     """Share of the lobe in the colour under the old light, in [0, 1]."""
+    emission: Float[Tensor, "n 3"] | None = None
+    """Emitted linear rgb; None for none."""
 
     @property
     def glossy(self) -> Bool[Tensor, "n"]:
-        """Whether each Gaussian has a lobe."""
-        return (self.reflectance > 0).any(1)
+        """Whether each Gaussian has a lobe, or emits light."""
+        lobes = (self.reflectance > 0).any(1)
+        return lobes if self.emission is None else lobes | (self.emission > 0).any(1)
 
     @property
     def mirrors(self) -> Bool[Tensor, "n"]:
         """Whether each Gaussian is a mirror, with reflections too sharp for its bands."""
         sharpest = self.concentration >= max(_CONCENTRATIONS)
         return sharpest & ~self.dielectric & (self.reflectance.mean(1) > 0.3)
+
+
+def known_materials(surface: KnownSurface) -> Materials:
+    """Represent metallic-roughness materials by lobes; sharper reflections than the sharpest lobe are blurred.
+
+    The concentration of a GGX lobe around the mirrored direction is 1 / (2 alpha^2) (Wang et al. 2009).
+    """
+    albedo = linear_from_srgb(spherical_harmonics.rgb_from_dc(surface.sh[:, 0]).clamp(0, 1))
+    metal = surface.metallic[:, None]
+    sharpness = -math.log(2) - 4 * surface.roughness.clamp_min(0.05).log()
+    lobes = torch.tensor(_CONCENTRATIONS)
+    return Materials(
+        reflectance=torch.where(metal > 0.5, metal * albedo + _FACING * (1 - metal), torch.ones(())),
+        concentration=lobes[(sharpness[:, None] - lobes.log()).abs().argmin(1)],
+        dielectric=surface.metallic <= 0.5,
+        matt=(1 - _FACING) * (1 - metal) * albedo,
+        share=torch.zeros(surface.count),
+        emission=surface.emission,
+    )
 
 
 def estimate_materials(
@@ -352,6 +374,8 @@ def gloss_bands(
         in_front = views + (towards - cosine)[..., None] * facing
         lobe = lobe_radiance(materials, rows, light, in_front + 2 * cosine[..., None] * facing, cosine)
         linear = (materials.matt[rows] * shade[rows])[:, None] + lobe
+        if materials.emission is not None:
+            linear = linear + materials.emission[rows][:, None]
         srgb = srgb_from_linear(linear.clamp(0, _BRIGHTEST))
         bands = torch.einsum("vk,nvc->nkc", project, srgb - 0.5)
         bands[:, 0] -= apply_gain(gaussians.select(torch.arange(gaussians.count)[rows]), shade[rows]).sh[:, 0]

@@ -18,17 +18,17 @@ from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.clock_sun import ClockSun
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, KnownSurface
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
-from splatgraft.relighting.light.light import Light, LightSource
+from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.light.samples import sample_light
-from splatgraft.relighting.materials import Materials, estimate_materials, reflected_light
+from splatgraft.relighting.materials import Materials, estimate_materials, known_materials, reflected_light
 from splatgraft.relighting.normals import Normals, estimate_normals
 from splatgraft.relighting.object_views import ObjectView, fuse_normals, object_views
 from splatgraft.relighting.shading import irradiance
@@ -125,8 +125,11 @@ class PreparedObject:
 def find_source_light(object_gaussians: Gaussians, source: SourceScene | None) -> SourceLight:
     """Return the light that an object was captured in, in its source's frame: the given one, or an estimate.
 
-    The object's own shading and shadow in its capture are evidence, too.
+    The object's own shading and shadow in its capture are evidence, too. A known surface has the colours of its albedo,
+    as under white light, whatever the source.
     """
+    if isinstance(object_gaussians, KnownSurface):
+        return Light((), fit_ambient(torch.ones(3)))
     if source is None:
         return None
     if source.light is not None:
@@ -161,12 +164,18 @@ def prepare_object(
     sphere = bounding_sphere(gaussians)
     # the capture's own cameras see the object best
     seen_from = cameras if source is None else placed.target_from_object.cameras(source.cameras)
-    views = object_views(gaussians, sphere, seen_from)
-    normals = _normals(placed, source, gaussians, seen_from, views)
+    is_known = isinstance(gaussians, KnownSurface)
+    views = () if is_known else object_views(gaussians, sphere, seen_from)
+    normals = _known(gaussians.normals) if is_known else _normals(placed, source, gaussians, seen_from, views)
     samples, lighting, notes = sample_light(light), None, []
     estimate = source_light if isinstance(source_light, EstimatedLight) else None
     old = source_light.light if isinstance(source_light, EstimatedLight) else source_light
-    if isinstance(old, Light) and source is not None:
+    if is_known and isinstance(old, Light):
+        (visible,) = self_visibility(gaussians, sphere, normals.vectors, (samples,))
+        received = torch.full((gaussians.count, 3), math.pi)  # of white light
+        lighting = SourceLighting(old, received, known_materials(gaussians), None)
+        notes.append(Note(f"Object {number} has a known surface, as meshes do.{_gloss_note(lighting.materials, gaussians)}"))
+    elif isinstance(old, Light) and source is not None:
         turned = old.rotated(placed.target_from_object.rotation)
         old_samples = sample_light(turned)
         visible, shares = self_visibility(gaussians, sphere, normals.vectors, (samples, old_samples))
@@ -229,6 +238,9 @@ def _normals(
         return fuse_normals(in_target, views, neighbours)
     if len(source.normals) != in_target.count:
         raise ValueError(f"relight: expected {in_target.count} normals, found {len(source.normals)}")
-    turned = source.normals @ placed.target_from_object.rotation.to(source.normals).T
-    known = torch.ones(in_target.count)
-    return Normals(vectors=turned, confidence=known, seen=known > 0)
+    return _known(source.normals @ placed.target_from_object.rotation.to(source.normals).T)
+
+
+def _known(normals: Float[Tensor, "n 3"]) -> Normals:
+    sure = torch.ones(len(normals))
+    return Normals(vectors=normals, confidence=sure, seen=sure > 0)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core import spherical_harmonics
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, KnownSurface
 from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
 
 _DIRECTIONS = {"L": (-1, 0, 0), "R": (1, 0, 0), "U": (0, -1, 0), "D": (0, 1, 0), "B": (0, 0, -1), "F": (0, 0, 1)}
@@ -32,11 +32,13 @@ def change_axes(gaussians: Gaussians, matrix: Float[Tensor, "3 3"]) -> Gaussians
     harmonics = spherical_harmonics.rotation_matrix(matrix, g.sh_degree)
     if torch.equal(permutation, torch.eye(3)):
         harmonics = harmonics.round()  # each basis function is even or odd under reflections in the axes
-    return Gaussians(
+    if isinstance(g, KnownSurface):
+        g = replace(g, normals=g.normals @ matrix.T)
+    return replace(
+        g,
         means=g.means @ matrix.T,
         log_scales=g.log_scales @ permutation.T,
         quaternions=torch.cat([g.quaternions[:, :1], axis], 1),
-        opacity_logits=g.opacity_logits,
         sh=torch.einsum("jk,nkc->njc", harmonics.to(g.sh), g.sh),
     )
 

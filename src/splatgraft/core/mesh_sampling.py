@@ -1,0 +1,239 @@
+"""Gaussians on the surface of a triangle mesh, one flat disc for each of many evenly spread points.
+
+1. Find the sides of the surface that can be seen: the outside of closed parts, both sides of open ones.
+2. Draw points evenly by area, and keep those of a maximal Poisson-disc pattern (greedy in random order).
+3. Look up normals and material at each point; textures are averaged over the point's share of the surface.
+"""
+
+import math
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
+
+from splatgraft.core.gaussians import KnownSurface
+from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.core.meshes import Mesh, Texture, unit
+from splatgraft.core.spherical_harmonics import dc_from_rgb
+
+DEFAULT_BUDGET = 60_000
+"""Number of Gaussians of a mesh; 1.5 radii away, one of a ball is then 2 pixels wide in a picture of 640."""
+_CANDIDATES = 5  # drawn points per kept one
+_DENSITY = 0.5  # kept points in a square as wide as their smallest distance, for that many candidates
+_WIDTH = 0.65  # standard deviation of a disc over the spacing of the points
+_THICKNESS = 0.1  # standard deviation across a disc over the spacing
+_OPACITY = 0.99
+_APART = 0.4  # distance of the discs of an open part's two sides from the surface, spacings
+_SAME_SIDE = 0.3  # smallest cosine between the normals of two points that exclude each other
+_DEGENERATE = 1e-9  # smallest area of a triangle over the square of the mesh's size
+
+
+def sample_mesh(mesh: Mesh, *, budget: int = DEFAULT_BUDGET, seed: int = 0) -> KnownSurface:
+    """Cover a mesh by flat Gaussians.
+
+    Args:
+        mesh: At least one triangle.
+        budget: Largest number of Gaussians.
+        seed: Seed of the points.
+
+    Returns:
+        Opaque Gaussians of degree 0 with the mesh's base colour, in the mesh's frame.
+
+    Raises:
+        ValueError: The mesh has no area.
+    """
+    across = np.cross(mesh.corners[:, 1] - mesh.corners[:, 0], mesh.corners[:, 2] - mesh.corners[:, 0])
+    area = 0.5 * np.linalg.norm(across, axis=1)
+    size = float(np.ptp(mesh.corners.reshape(-1, 3), axis=0).max())
+    rows = (area > _DEGENERATE * size**2).nonzero()[0]
+    if not len(rows):
+        raise ValueError("expected triangles with an area, found none")
+    inverted, is_open = _sides(mesh.corners[rows])
+    # an open part appears twice, once with its triangles turned round
+    triangle = np.concatenate([rows, rows[is_open]])
+    sign = np.concatenate([np.where(inverted, -1.0, 1.0), np.full(int(is_open.sum()), -1.0)])
+    rng = np.random.default_rng(seed)
+    which, weights = _drawn(area[triangle], _CANDIDATES * budget, rng)
+    facing = unit(across)[triangle[which]] * sign[which, None]
+    points = np.einsum("nc,nci->ni", weights, mesh.corners[triangle[which]])
+    total = float(area[triangle].sum())
+    kept = _spread(points, facing, radius=math.sqrt(_DENSITY * total / budget))[:budget]
+    which, weights, points, facing = which[kept], weights[kept], points[kept], facing[kept]
+    spacing = math.sqrt(total / len(kept))
+    lifted = np.concatenate([is_open, np.ones(int(is_open.sum()), bool)])[which]
+    points = points + _APART * spacing * lifted[:, None] * facing
+    return _gaussians(mesh, triangle[which], weights, (points, facing, sign[which]), spacing)
+
+
+def _sides(corners: Float[np.ndarray, "t 3 3"]) -> tuple[Bool[np.ndarray, "t"], Bool[np.ndarray, "t"]]:
+    """Find the triangles of closed parts that face inwards, and those of open parts.
+
+    A part is closed if each of its edges is met as often in one direction as in the other.
+    """
+    size = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    grid = np.round(corners.reshape(-1, 3) / (1e-6 * size)).astype(np.int64)
+    _, vertex = np.unique(grid, axis=0, return_inverse=True)
+    vertex = vertex.reshape(-1, 3)
+    begin, end = vertex.ravel(), np.roll(vertex, -1, axis=1).ravel()
+    count = int(vertex.max()) + 1
+    _, label = connected_components(coo_array((np.ones(len(begin)), (begin, end)), (count, count)), directed=False)
+    part = label[vertex[:, 0]]
+    key, direction = np.minimum(begin, end) * count + np.maximum(begin, end), np.sign(end - begin)
+    edge, first, at = np.unique(key, return_index=True, return_inverse=True)
+    unpaired = np.bincount(at, weights=direction, minlength=len(edge)) != 0
+    is_open = np.bincount(label[begin[first[unpaired]]], minlength=int(label.max()) + 1) > 0
+    centred = corners - corners.reshape(-1, 3).mean(0)
+    volume = np.einsum("ti,ti->t", centred[:, 0], np.cross(centred[:, 1], centred[:, 2]))
+    inwards = np.bincount(part, weights=volume, minlength=len(is_open)) < 0
+    return inwards[part] & ~is_open[part], is_open[part]
+
+
+def _drawn(
+    area: Float[np.ndarray, "t"], count: int, rng: np.random.Generator
+) -> tuple[Int[np.ndarray, "c"], Float[np.ndarray, "c 3"]]:
+    """Draw triangles and barycentric coordinates evenly by area, in random order."""
+    filled = np.cumsum(area)
+    at = (rng.permutation(count) + rng.random(count)) / count * filled[-1]
+    which = np.minimum(np.searchsorted(filled, at, side="right"), len(area) - 1)
+    u, v = rng.random((2, count))
+    root = np.sqrt(u)
+    return which, np.stack([1 - root, root * (1 - v), root * v], 1)
+
+
+def _spread(points: Float[np.ndarray, "c 3"], facing: Float[np.ndarray, "c 3"], *, radius: float) -> np.ndarray:
+    """Choose points in their order, without those that lie within a radius of a chosen one of the same side."""
+    pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
+    pairs = pairs[np.einsum("pi,pi->p", facing[pairs[:, 0]], facing[pairs[:, 1]]) > _SAME_SIDE]
+    # query_pairs lists the earlier point first
+    is_kept, is_left = np.zeros(len(points), bool), np.ones(len(points), bool)
+    while is_left.any():
+        waits = np.zeros(len(points), bool)
+        waits[pairs[:, 1]] = True
+        chosen = is_left & ~waits
+        is_kept |= chosen
+        excluded = pairs[chosen[pairs[:, 0]], 1]
+        is_left &= ~chosen
+        is_left[excluded] = False
+        pairs = pairs[is_left[pairs[:, 0]] & is_left[pairs[:, 1]]]
+    return is_kept.nonzero()[0]
+
+
+def _gaussians(
+    mesh: Mesh,
+    triangle: Int[np.ndarray, "n"],
+    weights: Float[np.ndarray, "n 3"],
+    placed: tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]],
+    spacing: float,
+) -> KnownSurface:
+    points, facing, sign = placed
+    n = len(points)
+    normals = unit(np.einsum("nc,nci->ni", weights, mesh.normals[triangle]))
+    normals = normals * np.where(np.einsum("ni,ni->n", normals, facing) < 0, -1, 1)[:, None]
+    uv = np.einsum("nc,nci->ni", weights, mesh.uv[triangle])
+    rgba = np.concatenate([np.einsum("nc,nci->ni", weights, mesh.colors[triangle]), np.ones((n, 1))], 1)
+    metallic, roughness, emission, is_there = np.empty(n), np.empty(n), np.zeros((n, 3)), np.ones(n, bool)
+    edges, uv_edges = (
+        (corners[:, 1:] - corners[:, :1]) for corners in (mesh.corners[triangle], mesh.uv[triangle].astype(np.float64))
+    )
+    determinant = np.linalg.det(uv_edges)
+    uv_per_area = np.abs(determinant) / np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    footprint = uv_per_area * spacing**2
+    for index, material in enumerate(mesh.materials):
+        here = mesh.material[triangle] == index
+        at = uv[here], footprint[here]
+        rgba[here] *= material.color
+        if material.color_map is not None:
+            rgba[here] *= _looked_up(material.color_map, *at, is_srgb=True)
+        is_there[here] = rgba[here, 3] >= material.alpha_cutoff
+        surface = 1.0 if material.surface_map is None else _looked_up(material.surface_map, *at)
+        surface = np.broadcast_to(surface, (int(here.sum()), 4))
+        metallic[here], roughness[here] = material.metallic * surface[:, 2], material.roughness * surface[:, 1]
+        glow = 1.0 if material.emission_map is None else _looked_up(material.emission_map, *at, is_srgb=True)[:, :3]
+        emission[here] = np.array(material.emission) * glow
+        if material.normal_map is not None:
+            bent = 2 * _looked_up(material.normal_map, *at)[:, :3] - 1
+            bent[:, :2] *= material.normal_scale
+            normals[here] = _bent(normals[here], bent, edges[here], uv_edges[here], sign[here])
+    rotation = np.stack([1 + facing[:, 2], -facing[:, 1], facing[:, 0], np.zeros(n)], 1)
+    rotation[facing[:, 2] < -0.999999] = (0, 1, 0, 0)
+    log_scales = np.log(spacing * np.array([_WIDTH, _WIDTH, _THICKNESS])).repeat(n).reshape(3, n).T
+    albedo = srgb_from_linear(torch.from_numpy(rgba[:, :3].clip(0, 1)).float())
+    fields = (points, log_scales, rotation / np.linalg.norm(rotation, axis=1, keepdims=True))
+    means, scales, quaternions = (torch.from_numpy(np.ascontiguousarray(field)).float() for field in fields)
+    known = (normals, metallic.clip(0, 1), roughness.clip(0, 1), emission)
+    return KnownSurface(
+        means,
+        scales,
+        quaternions,
+        torch.full((n,), _OPACITY).logit(),
+        dc_from_rgb(albedo)[:, None],
+        *(torch.from_numpy(values).float() for values in known),
+    ).select(torch.from_numpy(is_there))
+
+
+def _bent(
+    normals: Float[np.ndarray, "n 3"],
+    bent: Float[np.ndarray, "n 3"],
+    edges: Float[np.ndarray, "n 2 3"],
+    uv_edges: Float[np.ndarray, "n 2 2"],
+    sign: Float[np.ndarray, "n"],
+) -> Float[np.ndarray, "n 3"]:
+    """Turn normals by a normal map's values, whose axes are along u, against v, and outwards."""
+    determinant = np.linalg.det(uv_edges)
+    scale = np.where(determinant == 0, 0.0, 1 / np.where(determinant == 0, 1, determinant))[:, None]
+    along = scale * (uv_edges[:, 1, 1:] * edges[:, 0] - uv_edges[:, 0, 1:] * edges[:, 1])
+    against = scale * (uv_edges[:, 1, :1] * edges[:, 0] - uv_edges[:, 0, :1] * edges[:, 1])
+    tangents = (unit(axis - np.einsum("ni,ni->n", axis, normals)[:, None] * normals) for axis in (along, against))
+    tangent, bitangent = tangents
+    # on the back of a sheet the same relief is seen from behind
+    lifted = sign[:, None] * (bent[:, :1] * tangent + bent[:, 1:2] * bitangent)
+    return unit(lifted + np.maximum(bent[:, 2:], 0.1) * normals)
+
+
+def _looked_up(
+    texture: Texture, uv: Float[np.ndarray, "n 2"], footprint: Float[np.ndarray, "n"], *, is_srgb: bool = False
+) -> Float[np.ndarray, "n 4"]:
+    """Average a texture over an area around each point; linear values in [0, 1].
+
+    Args:
+        texture: The image.
+        uv: Texture coordinates of n points.
+        footprint: Area of each average, squares of texture coordinates.
+        is_srgb: Whether its colours are sRGB; alpha never is.
+    """
+    matrix = np.array(texture.image_from_uv)
+    at = uv @ matrix[:, :2].T + matrix[:, 2]
+    for axis, wrap in enumerate(texture.wrap):
+        values = at[:, axis]
+        folded = 1 - np.abs(values % 2 - 1)
+        at[:, axis] = {"repeat": values % 1, "mirror": folded, "clamp": values.clip(0, 1)}[wrap]
+    image = torch.from_numpy(texture.pixels.astype(np.float32) / 255)
+    if is_srgb:
+        image[..., :3] = linear_from_srgb(image[..., :3])
+    level_image = image.numpy()
+    h, w = level_image.shape[:2]
+    texels = footprint * abs(np.linalg.det(matrix[:, :2])) * h * w
+    level = np.round(0.5 * np.log2(np.maximum(texels, 1))).astype(int)
+    out = np.empty((len(uv), 4))
+    for step in range(int(level.max(initial=0)) + 1):
+        h, w = level_image.shape[:2]
+        here = level == step if min(h, w) > 1 else level >= step
+        x, y = at[here, 0] * w - 0.5, at[here, 1] * h - 0.5
+        out[here] = _bilinear(level_image, x, y)
+        if min(h, w) == 1:
+            break
+        level_image = cv2.resize(level_image, (max(w // 2, 1), max(h // 2, 1)), interpolation=cv2.INTER_AREA)
+    return out
+
+
+def _bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> Float[np.ndarray, "n 4"]:
+    h, w = image.shape[:2]
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    fx, fy = (x - left)[:, None], (y - top)[:, None]
+    columns, rows = (left.clip(0, w - 1), (left + 1).clip(0, w - 1)), (top.clip(0, h - 1), (top + 1).clip(0, h - 1))
+    upper, lower = ((1 - fx) * image[row, columns[0]] + fx * image[row, columns[1]] for row in rows)
+    return (1 - fy) * upper + fy * lower
