@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from splatgraft.commands.light import LightAt
 from splatgraft.exports.export import ExportOptions, export_scene
 from splatgraft.exports.pages import write_report_file
 from splatgraft.folders.export_source import project_of, read_export_source
@@ -39,10 +40,15 @@ class Export:
         return self.scene.parent if self.scene.name == PROJECT_FILE else self.scene
 
     def execute(self, console: Console) -> int:
-        """Write the file and print the assumptions, its size and the time."""
+        """Write the file and print the assumptions, its size and the time; with the layer scene-with-shadow also the
+        light at the object."""
         self._say_stale(console)
         for sentence in self.write(console):
             console.say(sentence)
+        if self.options.layer == "scene-with-shadow" and (self.folder / PROJECT_FILE).is_file():
+            in_world = self.options.frame == "world" or (self.options.frame == "auto" and self.to.suffix == ".glb")
+            light = self.to.with_name(f"{self.to.stem}_light.hdr")
+            LightAt(self.folder, out=light, frame="world" if in_world else "capture").execute(console)
         console.result(self.to)
         return 0
 

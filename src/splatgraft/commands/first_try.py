@@ -40,7 +40,7 @@ class Try:
 
     object: Positional
     """The capture with the object: photos (a folder or a .zip), a video, a COLMAP folder, a folder with
-    transforms.json, or a trained scene (.ply, .spz, .splat)."""
+    transforms.json, a trained scene (.ply, .spz, .splat), or a mesh (.glb, .gltf, .obj, .stl, .ply)."""
     place: Positional
     """The capture or the scene that receives it."""
     out: Path | None = None

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatgraft.folders.input_description import require_input
-from splatgraft.formats import is_scene
+from splatgraft.formats import has_known_surface, is_scene
 from splatgraft.project.layout import PROJECT_FILE
 from splatgraft.project.project_file import TEMPLATE
 from splatgraft.project.step import Positional
@@ -23,7 +23,8 @@ class Init:
     """The project's folder; made if it does not exist."""
     source: Path
     """The capture with the object: photos (a folder or a .zip), a video, a COLMAP folder or a folder with
-    transforms.json; or a trained scene (.ply, .spz, .splat, .sog, .glb, .ksplat) without photographs."""
+    transforms.json; or a trained scene (.ply, .spz, .splat, .sog, .glb, .ksplat) without photographs; or a mesh (.glb,
+    .gltf, .obj, .stl, .ply)."""
     target: Path
     """The capture or the scene that receives it."""
     full: bool = False
@@ -50,7 +51,9 @@ class Init:
             text = full_project_text(source=source, target=target)
         else:
             text = TEMPLATE.replace("{source}", source).replace("{target}", target)
-        if is_scene(self.source):
+        if has_known_surface(self.target):
+            raise ValueError(f"{self.target}: expected a capture or a scene that receives the object, found a mesh")
+        if is_scene(self.source) and not has_known_surface(self.source):
             # pictures made of a trained scene have no masks
             text = with_keys(text, "segment", {"mask_source": "grabcut"})
         return text

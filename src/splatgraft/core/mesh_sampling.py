@@ -25,9 +25,11 @@ DEFAULT_BUDGET = 60_000
 _CANDIDATES = 5  # drawn points per kept one
 _DENSITY = 0.5  # kept points in a square as wide as their smallest distance, for that many candidates
 _WIDTH = 0.65  # standard deviation of a disc over the spacing of the points
-_THICKNESS = 0.1  # standard deviation across a disc over the spacing
+_THICKNESS = 0.02  # standard deviation across a disc over the spacing
 _OPACITY = 0.99
-_APART = 0.4  # distance of the discs of an open part's two sides from the surface, spacings
+_INSET = 0.65  # distance of the discs from silhouettes and edges, which they would else overlap, spacings
+_APART = 0.1  # distance of the discs of an open part's two sides from the surface, spacings
+_SHARP = math.cos(math.radians(30))  # cosine of half the angle between the normals of a ridge's sides
 _SAME_SIDE = 0.3  # smallest cosine between the normals of two points that exclude each other
 _DEGENERATE = 1e-9  # smallest area of a triangle over the square of the mesh's size
 
@@ -52,27 +54,34 @@ def sample_mesh(mesh: Mesh, *, budget: int = DEFAULT_BUDGET, seed: int = 0) -> K
     rows = (area > _DEGENERATE * size**2).nonzero()[0]
     if not len(rows):
         raise ValueError("expected triangles with an area, found none")
-    inverted, is_open = _sides(mesh.corners[rows])
+    inverted, is_open, is_edge = _sides(mesh.corners[rows])
     # an open part appears twice, once with its triangles turned round
     triangle = np.concatenate([rows, rows[is_open]])
     sign = np.concatenate([np.where(inverted, -1.0, 1.0), np.full(int(is_open.sum()), -1.0)])
     rng = np.random.default_rng(seed)
+    total = float(area[triangle].sum())
     which, weights = _drawn(area[triangle], _CANDIDATES * budget, rng)
+    at_edge = np.concatenate([is_edge, is_edge[is_open]])[which] & (
+        _edge_distances(mesh.corners[triangle], which, weights) < _INSET * math.sqrt(total / budget)
+    )
+    which, weights = (values[~at_edge.any(1)] for values in (which, weights))
     facing = unit(across)[triangle[which]] * sign[which, None]
     points = np.einsum("nc,nci->ni", weights, mesh.corners[triangle[which]])
-    total = float(area[triangle].sum())
     kept = _spread(points, facing, radius=math.sqrt(_DENSITY * total / budget))[:budget]
     which, weights, points, facing = which[kept], weights[kept], points[kept], facing[kept]
     spacing = math.sqrt(total / len(kept))
     lifted = np.concatenate([is_open, np.ones(int(is_open.sum()), bool)])[which]
-    points = points + _APART * spacing * lifted[:, None] * facing
+    points = points + spacing * np.where(lifted, _APART, -_INSET)[:, None] * facing
     return _gaussians(mesh, triangle[which], weights, (points, facing, sign[which]), spacing)
 
 
-def _sides(corners: Float[np.ndarray, "t 3 3"]) -> tuple[Bool[np.ndarray, "t"], Bool[np.ndarray, "t"]]:
-    """Find the triangles of closed parts that face inwards, and those of open parts.
+def _sides(
+    corners: Float[np.ndarray, "t 3 3"],
+) -> tuple[Bool[np.ndarray, "t"], Bool[np.ndarray, "t"], Bool[np.ndarray, "t 3"]]:
+    """Find the triangles of closed parts that face inwards, those of open parts, and ends and sharp ridges as edges.
 
-    A part is closed if each of its edges is met as often in one direction as in the other.
+    A part is closed if each of its edges is met as often in one direction as in the other. Edge i of a triangle begins
+    at corner i.
     """
     size = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
     grid = np.round(corners.reshape(-1, 3) / (1e-6 * size)).astype(np.int64)
@@ -89,7 +98,30 @@ def _sides(corners: Float[np.ndarray, "t 3 3"]) -> tuple[Bool[np.ndarray, "t"], 
     centred = corners - corners.reshape(-1, 3).mean(0)
     volume = np.einsum("ti,ti->t", centred[:, 0], np.cross(centred[:, 1], centred[:, 2]))
     inwards = np.bincount(part, weights=volume, minlength=len(is_open)) < 0
-    return inwards[part] & ~is_open[part], is_open[part]
+    is_inverted = inwards[part] & ~is_open[part]
+    outward = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    middle, normal = (
+        values.repeat(3, axis=0) for values in (centred.mean(1), outward * np.where(is_inverted, -1, 1)[:, None])
+    )
+
+    def by_edge(values: Float[np.ndarray, "h"]) -> Float[np.ndarray, "e"]:
+        return np.bincount(at, weights=values, minlength=len(edge))
+
+    middles, normals = (np.stack([by_edge(v[:, i]) for i in range(3)], 1) for v in (middle, normal))
+    # on a ridge each of two triangles lies below the other's plane
+    below = (middles * normals).sum(1) < 2 * by_edge((middle * normal).sum(1))
+    is_sharp = np.linalg.norm(normals, axis=1) < _SHARP * by_edge(np.ones(len(at)))
+    return is_inverted, is_open[part], (unpaired | (is_sharp & below))[at].reshape(-1, 3)
+
+
+def _edge_distances(
+    corners: Float[np.ndarray, "t 3 3"], which: Int[np.ndarray, "c"], weights: Float[np.ndarray, "c 3"]
+) -> Float[np.ndarray, "c 3"]:
+    """Compute the distances of points from the edges of their triangles."""
+    edges = np.roll(corners, -1, axis=1) - corners
+    double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1, keepdims=True)
+    heights = double_area / np.linalg.norm(edges, axis=2)
+    return np.roll(weights, 1, axis=1) * heights[which]  # the corner before edge i is opposite to it
 
 
 def _drawn(
@@ -217,7 +249,7 @@ def _looked_up(
     level_image = image.numpy()
     h, w = level_image.shape[:2]
     texels = footprint * abs(np.linalg.det(matrix[:, :2])) * h * w
-    level = np.round(0.5 * np.log2(np.maximum(texels, 1))).astype(int)
+    level = (0.5 * np.log2(np.maximum(texels, 1))).astype(int)
     out = np.empty((len(uv), 4))
     for step in range(int(level.max(initial=0)) + 1):
         h, w = level_image.shape[:2]

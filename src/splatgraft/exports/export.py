@@ -26,7 +26,7 @@ _PICTURES, _TURNTABLES = (".png", ".jpg"), (".mp4", ".gif", ".webp")
 EXPORT_SUFFIXES = (".html", *WRITTEN_SCENE_SUFFIXES, *_PICTURES, *_TURNTABLES)
 """Suffixes of the files that can be written."""
 
-Layer = Literal["all", "object", "scene", "shadow", "object-with-shadow"]
+Layer = Literal["all", "object", "scene", "scene-with-shadow", "shadow", "object-with-shadow"]
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,9 @@ class ExportOptions:
     """Layer, frame and precision of an export."""
 
     layer: Layer = "all"
-    """all: the whole scene; object: the relit object alone; scene: the place without object and shadow; shadow: black
-    Gaussians that darken a picture behind them as the shadow does; object-with-shadow: both, for a compositor."""
+    """all: the whole scene; object: the relit object alone; scene: the place without object and shadow;
+    scene-with-shadow: the place with the object's shadow and bounce, for those who draw the object itself as a mesh;
+    shadow: black Gaussians that darken a picture behind them as the shadow does; object-with-shadow: both, for a compositor."""
     frame: Literal["auto", "capture", "world"] = "auto"
     """Frame of a scene. capture: as in the project; world: upright and in metres, as far as they are known; auto: world
     for .glb, which asks for it, else capture."""
@@ -92,7 +93,7 @@ def export_scene(
     scenes = {source.title: gaussians}
     if options.layer == "all" and source.pasted is not None:
         scenes = {"Before": _limited(_finite(source.pasted)[0], options), "After": gaussians}
-    background = 0.0 if options.layer in ("all", "scene") else _PART_BACKGROUND
+    background = 0.0 if options.layer in ("all", "scene", "scene-with-shadow") else _PART_BACKGROUND
     write_viewer_page(to, scenes, view, title=source.title, background=background)
     return said
 
@@ -119,6 +120,8 @@ def layer_of(source: ExportSource, layer: Layer, *, progress: Progress = silent)
         )
     if layer == "scene":
         return _finite(source.place)
+    if layer == "scene-with-shadow":
+        return _finite(source.scene.select(~source.is_object))
     object_ = source.scene.select(source.is_object)
     if layer == "object":
         return _finite(object_)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from splatgraft.capture import MIN_VIEWS, describe_video
 from splatgraft.folders.capture_files import has_poses
-from splatgraft.formats import is_scene, read_capture, read_gaussians
+from splatgraft.formats import has_known_surface, is_scene, read_capture, read_gaussians
 from splatgraft.formats.captures.masks import describe_masks, find_photos
 from splatgraft.formats.captures.photo_archive import count_archived_photos, is_archive
 from splatgraft.project.layout import PROJECT_FILE, SCENE_FILE
@@ -56,9 +56,7 @@ def _described(path: Path) -> InputDescription:
         folder = path.parent if path.is_file() else path
         return InputDescription("project", f"a project of its own: splatgraft edit {folder}")
     if is_scene(path):
-        size = sum(p.stat().st_size for p in ([path] if path.is_file() else path.iterdir()) if p.is_file())
-        count = "" if size > 1 << 30 else f" of {read_gaussians(path).count:,} Gaussians"
-        return InputDescription("scene", f"a trained scene{count}: images are rendered from it, nothing is trained")
+        return _scene(path)
     if has_poses(path):
         posed = read_capture(path)
         masks = describe_masks(posed.image_paths, posed.mask_paths)
@@ -72,6 +70,15 @@ def _described(path: Path) -> InputDescription:
             "video", f"{describe_video(path)}: frames are taken, poses are found, and a scene is trained"
         )
     return _folder_of_photos(path)
+
+
+def _scene(path: Path) -> InputDescription:
+    if has_known_surface(path):
+        count = read_gaussians(path).count
+        return InputDescription("scene", f"a mesh, covered by {count:,} Gaussians of known normals and materials")
+    size = sum(p.stat().st_size for p in ([path] if path.is_file() else path.iterdir()) if p.is_file())
+    count = "" if size > 1 << 30 else f" of {read_gaussians(path).count:,} Gaussians"
+    return InputDescription("scene", f"a trained scene{count}: images are rendered from it, nothing is trained")
 
 
 def _folder_of_photos(path: Path) -> InputDescription:

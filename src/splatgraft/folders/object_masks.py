@@ -19,7 +19,7 @@ from splatgraft.rendering import view_operator
 from splatgraft.runtime.lazy_sequence import LazySequence
 from splatgraft.segmentation import ObjectRegion
 
-MaskSource = Literal["auto", "files", "grabcut", "sam2", "birefnet", "box"]
+MaskSource = Literal["auto", "files", "grabcut", "sam2", "birefnet", "box", "whole"]
 """Origin of the masks for `segment`."""
 
 _MASK_RED, _SELECTION_BLUE = (255, 60, 40), (60, 220, 255)

@@ -1,5 +1,4 @@
-"""Reading and writing of scenes, captures and cameras; the suffix, or the files in a folder, give the format.
-"""
+"""Reading and writing of scenes, captures and cameras; the suffix, or the files in a folder, give the format."""
 
 from collections.abc import Callable
 from functools import partial
@@ -12,6 +11,7 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures import read_capture_file
 from splatgraft.formats.captures.transforms_json import write_cameras, write_capture
 from splatgraft.formats.captures.views import ViewRecord, cameras, posed_images
+from splatgraft.formats.meshes import has_known_surface as file_has_known_surface
 from splatgraft.formats.meshes import read_gltf, read_ply, read_polygon_file
 from splatgraft.formats.parsing import parsing
 from splatgraft.formats.scenes.axes import with_axes
@@ -30,6 +30,7 @@ __all__ = [
     "WRITTEN_SCENE_SUFFIXES",
     "SceneFile",
     "SceneMetadata",
+    "has_known_surface",
     "is_scene",
     "list_capture_images",
     "read_cameras",
@@ -80,6 +81,12 @@ def is_scene(path: Path) -> bool:
     """Whether the suffix is that of a trained scene or a mesh, or the path is a folder of SOG images or its
     meta.json."""
     return path.suffix.lower() in SCENE_SUFFIXES or is_sog_folder(path)
+
+
+def has_known_surface(path: Path) -> bool:
+    """Whether a scene's file is a mesh, or Gaussians whose normals and materials are known."""
+    with parsing(path):
+        return path.is_file() and file_has_known_surface(path)
 
 
 def scene_files(path: Path) -> tuple[Path, ...]:

@@ -2,7 +2,8 @@
 
     {"metres_per_unit": 0.21, "source": "a length of 0.3 m between two points"}
 
-It lies in the capture's folder. If a step made the capture, it lies beside the folder, so that a new run keeps it.
+It lies in the capture's folder. If a step made the capture, it lies beside the folder, so that a new run keeps it; the
+step may write one into the folder, from a file that states its size, which counts if there is none beside it.
 """
 
 from dataclasses import asdict, dataclass
@@ -29,10 +30,16 @@ def scale_path(capture: Path) -> Path:
     return (folder.parent if (folder / "step.json").is_file() else folder) / SCALE_FILE
 
 
+def find_scale(capture: Path) -> Path | None:
+    """Find the scale of a capture, the user's or else the step's; None if it has none."""
+    folder = capture if capture.is_dir() else capture.parent
+    return next((path for path in (scale_path(capture), folder / SCALE_FILE) if path.is_file()), None)
+
+
 def read_scale(capture: Path) -> MetricScale | None:
     """Read the scale of a capture; None if it has none."""
-    path = scale_path(capture)
-    if not path.is_file():
+    path = find_scale(capture)
+    if path is None:
         return None
     content = load(path)
     if not isinstance(content, dict):
@@ -44,7 +51,10 @@ def read_scale(capture: Path) -> MetricScale | None:
 
 
 def write_scale(capture: Path, scale: MetricScale) -> Path:
-    """Write the scale of a capture; returns the file."""
+    """Write the scale of a capture; returns the file.
+
+    A step that makes the folder `capture` writes it inside, because step.json is written last.
+    """
     path = scale_path(capture)
     save(path, asdict(scale))
     return path

@@ -1,5 +1,6 @@
 """Result of a light transfer: a composite with shading, shadow, bounce and gloss as layers to weight and bake."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -213,7 +214,12 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
         bands_replaced=torch.cat([torch.zeros(count, dtype=torch.bool), *replaced])[order],
         objects=tuple(one.gaussians for one in objects),
         light=scene.light,
-        report=(_light_note(scene), *(note for one in objects for note in one.notes), *_shadow_notes(on_scene.shadow)),
+        report=(
+            _light_note(scene),
+            *(note for one in objects for note in one.notes),
+            *_level_notes(scene, objects),
+            *_shadow_notes(on_scene.shadow),
+        ),
         estimate=scene.estimate,
         received=tuple(one.received for one in shadings),
         prepared=tuple(objects),
@@ -232,6 +238,15 @@ def _light_note(scene: SceneLight) -> Note:
         "shadows may be wrong: photograph the surroundings of the place, or give the light (--given-light)."
     )
     return Note(text, "warning", remedy)
+
+
+def _level_notes(scene: SceneLight, objects: Sequence[PreparedObject]) -> tuple[Note, ...]:
+    """Describe the uncertain level of an estimated light, which meshes show, because their albedo is absolute."""
+    if scene.estimate is None or not any(isinstance(one.gaussians, KnownSurface) for one in objects):
+        return ()
+    stops = scene.estimate.hidden.level_sd / math.log(2)
+    text = f"A mesh is as bright as it should be to a standard error of {stops:.1f} stops, that of the light's level."
+    return (Note(text, "said", "Compare it with things of similar colour beside it; exposure corrects it."),)
 
 
 def _shadow_notes(shadow: Float[Tensor, "n 3"]) -> tuple[Note, ...]:

@@ -135,17 +135,18 @@ class Materials:
 def known_materials(surface: KnownSurface) -> Materials:
     """Represent metallic-roughness materials by lobes; sharper reflections than the sharpest lobe are blurred.
 
-    The concentration of a GGX lobe around the mirrored direction is 1 / (2 alpha^2) (Wang et al. 2009).
+    The concentration of a GGX lobe around the mirrored direction is 1 / (2 alpha^2) (Wang et al. 2009). A rough
+    dielectric reflects less towards grazing views (Lagarde 2011); what its lobe lacks is matt.
     """
     albedo = linear_from_srgb(spherical_harmonics.rgb_from_dc(surface.sh[:, 0]).clamp(0, 1))
-    metal = surface.metallic[:, None]
+    metal, rough = surface.metallic[:, None], surface.roughness[:, None]
     sharpness = -math.log(2) - 4 * surface.roughness.clamp_min(0.05).log()
     lobes = torch.tensor(_CONCENTRATIONS)
     return Materials(
-        reflectance=torch.where(metal > 0.5, metal * albedo + _FACING * (1 - metal), torch.ones(())),
+        reflectance=torch.where(metal > 0.5, metal * albedo + _FACING * (1 - metal), 1 - rough),
         concentration=lobes[(sharpness[:, None] - lobes.log()).abs().argmin(1)],
         dielectric=surface.metallic <= 0.5,
-        matt=(1 - _FACING) * (1 - metal) * albedo,
+        matt=(1 - metal) * ((1 - _FACING) * albedo + _FACING * rough),
         share=torch.zeros(surface.count),
         emission=surface.emission,
     )

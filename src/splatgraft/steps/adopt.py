@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from splatgraft.core.mesh_sampling import DEFAULT_BUDGET
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import SceneFile, read_capture, read_scene, scene_files, write_gaussians
 from splatgraft.formats.scenes.axes import rdf_from
@@ -28,13 +29,16 @@ class Adopt:
     """Take over a trained scene; prints the statements of its file and the assumptions about it."""
 
     scene: Positional
-    """A .ply, .spz, .splat, .sog, .glb or .ksplat, in the frame of its capture if there is one."""
+    """A .ply, .spz, .splat, .sog, .glb or .ksplat, in the frame of its capture if there is one; or a mesh: .glb, .gltf,
+    .obj, .stl or .ply."""
     out: Path = Path("scene")
     """Folder for scene.ply."""
     capture: Path | None = None
     """Capture folder of the scene, which a project makes first; warns if the scene and its points do not overlap."""
     axes: str | None = None
     """Directions of the file's x, y and z (RDF: right, down, front), if those of its format are wrong."""
+    mesh_budget: int = DEFAULT_BUDGET
+    """Maximum number of Gaussians that cover a mesh."""
 
     def inputs(self) -> Inputs:
         """Return the scene's files."""
@@ -42,7 +46,7 @@ class Adopt:
 
     def write(self, folder: Path, context: Context) -> None:
         """Write scene.ply."""
-        found = read_scene(self.scene, axes=self.axes)
+        found = read_scene(self.scene, axes=self.axes, mesh_budget=self.mesh_budget)
         for sentence in found.said():
             context.console.say(f"{self.scene}: {sentence}")
         if self.capture is not None and has_poses(self.capture):

@@ -39,6 +39,7 @@ from splatgraft.formats.captures import read_given_poses
 from splatgraft.formats.captures.exif import read_geotag
 from splatgraft.formats.captures.masks import PhotoFiles, describe_masks, find_photos
 from splatgraft.formats.captures.photo_archive import is_archive, unpack_photos
+from splatgraft.project.metric_scale import MetricScale, write_scale
 from splatgraft.project.step import Context, Inputs, Positional
 from splatgraft.rendering import render
 from splatgraft.runtime.note import Note
@@ -172,6 +173,8 @@ class Capture:
         found, report = place_virtual_cameras(scene, self.look, stated_up=read.metadata.up, progress=context.progress)
         for sentence in read.said():
             context.console.say(f"{self.capture}: {sentence}")
+        if read.metadata.metres_per_unit is not None:
+            write_scale(folder, MetricScale(read.metadata.metres_per_unit, f"stated in {self.capture.name}"))
         (folder / "images").mkdir()
         paths = tuple(folder / "images" / f"{name}.png" for name in found.cameras.names)
         for index, (path, camera) in enumerate(zip(paths, found.cameras, strict=True)):

@@ -12,7 +12,7 @@ from splatgraft.folders.composite_folder import composite_of, placement_files, w
 from splatgraft.folders.picture_points import point_in_world
 from splatgraft.formats import read_cameras, read_gaussians, read_images
 from splatgraft.project.layout import COVERAGE_FILE
-from splatgraft.project.metric_scale import MetricScale, read_scale, scale_path
+from splatgraft.project.metric_scale import MetricScale, find_scale, read_scale
 from splatgraft.project.placement import ObjectPlacement, Placement, read_placement
 from splatgraft.project.step import Context, Inputs
 from splatgraft.runtime.note import Note
@@ -54,7 +54,7 @@ class Compose:
             return scenes | {"placement": placement_files(self.placement)}
         captures = [path for path in (self.cameras, self.object_cameras) if path is not None]
         cameras = [file for path in captures for file in camera_files(path)]
-        scales = [path for path in map(scale_path, captures) if path.is_file()]
+        scales = [path for path in map(find_scale, captures) if path is not None]
         surroundings = [] if self.surroundings is None else [self.surroundings]
         return scenes | {"cameras": (*cameras, *surroundings, *scales)}
 

@@ -27,7 +27,7 @@ from splatgraft.folders.object_masks import (
     write_masks,
 )
 from splatgraft.folders.picture_points import prompts_by_view
-from splatgraft.formats import read_capture, read_gaussians, write_gaussians
+from splatgraft.formats import has_known_surface, read_capture, read_gaussians, write_gaussians
 from splatgraft.project.gaussian_flags import read_corrections, write_flags
 from splatgraft.project.layout import COVERAGE_FILE, IS_GUESSED_FILE, OBJECT_FILE, SELECTION_FILE, SURROUNDINGS_FILE
 from splatgraft.project.prompts import read_prompts
@@ -86,8 +86,8 @@ class Segment:
     the object), selection.npy, feature.npy, agreement.json and views.png (agreement of the masks); masks/ if made."""
     mask_source: MaskSource = "auto"
     """files: masks/ beside the images, or --masks. grabcut, sam2: cut from the images, guided by the scene, --prompts
-    and --box. birefnet: from a network. box: no masks, all Gaussians whose centre is in the box (if the scene is the
-    object alone, a box around everything). auto: files if every image has one, else grabcut."""
+    and --box. birefnet: from a network. box: no masks, all Gaussians whose centre is in the box. whole: no masks, the
+    scene is the object alone. auto: whole for a mesh; files if every image has one, else grabcut."""
     masks: Path | None = None
     """Folder of masks named like the images, white on the object; views without a mask are left out."""
     prompts: Path | None = None
@@ -137,8 +137,10 @@ class Segment:
         on_device = scene.to(device)
         box = None if self.box is None else Box(torch.tensor(self.box[:3]), torch.tensor(self.box[3:]))
         capture = read_capture(self.capture)
-        masked, feature = None, None
-        if self._source(capture) == "box":
+        masked, feature, keep = None, None, self.keep
+        if self._source(capture) == "whole":
+            feature, keep = torch.ones(scene.count), "all"
+        elif self._source(capture) == "box":
             if box is None:
                 raise ValueError("--mask-source box: expected --box beside it, found none")
             feature = box.contains(scene.means).float()
@@ -151,7 +153,7 @@ class Segment:
             if masked.region is not None:
                 feature = feature * masked.region.allows(on_device.means)
             feature = feature.cpu()
-        selection = select_object(scene, feature, SelectOptions(threshold=self.threshold, box=box, keep=self.keep))
+        selection = select_object(scene, feature, SelectOptions(threshold=self.threshold, box=box, keep=keep))
         if self.corrections is not None:
             selection = apply_corrections(selection, read_corrections(self.corrections))
         context.console.say(f"object: {int(selection.sum()):,} of {scene.count:,} Gaussians")
@@ -180,6 +182,8 @@ class Segment:
         """Return the source of masks, with `auto` resolved."""
         if self.mask_source != "auto":
             return self.mask_source
+        if has_known_surface(self.scene):
+            return "whole"
         given = self.masks is not None or len(capture.with_masks()) == len(capture)
         return "files" if given and self.prompts is None else "grabcut"
 

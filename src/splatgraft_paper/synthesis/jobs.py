@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -68,11 +69,22 @@ class Take:
 
 
 @dataclass(frozen=True)
+class Model:
+    """A .glb that stands upright in a scene."""
+
+    path: str
+    size: float
+    """Metres per unit of the file's metre."""
+    location: Vector
+    """Place of its origin."""
+
+
+@dataclass(frozen=True)
 class Job:
     """Description of the pictures that one Blender process renders."""
 
     scene: Scene
-    objects: dict[str, tuple[Part, ...]]
+    objects: Mapping[str, tuple[Part, ...] | Model]
     cameras: tuple[Camera, ...]
     takes: tuple[Take, ...]
     size: RenderSize

@@ -7,8 +7,9 @@ from splatgraft.core.meshes import Mesh
 from splatgraft.formats import gltf
 from splatgraft.formats.meshes.gltf_mesh import read_gltf_mesh
 from splatgraft.formats.meshes.polygon_files import AXES, is_polygon_ply, read_polygons
+from splatgraft.formats.scenes import ply
 from splatgraft.formats.scenes.gaussian_glb import has_gaussians, read_gaussian_glb
-from splatgraft.formats.scenes.gaussian_ply import read_gaussian_ply
+from splatgraft.formats.scenes.gaussian_ply import SURFACE, read_gaussian_ply
 from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
 
 _UP = (0.0, -1.0, 0.0)  # of a mesh, in the axes RDF
@@ -32,6 +33,15 @@ def read_polygon_file(path: Path, budget: int) -> SceneFile:
     """Read a mesh of an .obj, .stl or .ply with at most `budget` Gaussians."""
     mesh, notes = read_polygons(path)
     return _covered(mesh, budget, AXES[path.suffix.lower()], SceneMetadata(_UP), notes)
+
+
+def has_known_surface(path: Path) -> bool:
+    """Whether a scene's file is a mesh, or a .ply of Gaussians whose normals and materials are known."""
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        vertex = ply.read_header(path).element("vertex")
+        return is_polygon_ply(path) or (vertex is not None and set(SURFACE) <= set(vertex.types))
+    return suffix in (".obj", ".stl") or (suffix in (".glb", ".gltf") and not has_gaussians(gltf.read_gltf(path)))
 
 
 def _covered(mesh: Mesh, budget: int, axes: str, metadata: SceneMetadata, notes: tuple[str, ...]) -> SceneFile:

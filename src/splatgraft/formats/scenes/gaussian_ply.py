@@ -28,10 +28,13 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATERNION = ("rot_0", "rot_1", "rot_2", "rot_3")
 _NORMALS = ("nx", "ny", "nz")
-_SURFACE = ("metallic", "roughness", "emission_0", "emission_1", "emission_2")
+SURFACE = ("metallic", "roughness", "emission_0", "emission_1", "emission_2")
+"""Properties of a known surface beside its normals."""
 _REST_COUNTS = tuple(3 * (spherical_harmonics.coefficient_count(d) - 1) for d in range(4))
 _ROWS_PER_WRITE = 1 << 14  # bounds the memory of a write
-_KNOWN = re.compile(r"x|y|z|n[xyz]|f_dc_[0-2]|f_rest_[0-9]+|opacity|scale_[0-2]|rot_[0-3]|metallic|roughness|emission_[0-2]|red|green|blue|alpha")
+_KNOWN = re.compile(
+    r"x|y|z|n[xyz]|f_dc_[0-2]|f_rest_[0-9]+|opacity|scale_[0-2]|rot_[0-3]|metallic|roughness|emission_[0-2]|red|green|blue|alpha"
+)
 """Properties that are read, normals, which are zeros, and colours for viewers."""
 _MAX_NAMED = 6  # properties that a note names
 
@@ -56,8 +59,8 @@ def read_gaussian_ply(path: Path) -> SceneFile:
     ]
     ply.read_into(header, vertex, columns)
     gaussians = Gaussians(*map(torch.from_numpy, (means, log_scales, quaternions, logits, sh)))
-    if {*_NORMALS, *_SURFACE} <= set(vertex.types):
-        gaussians = _with_surface(gaussians, torch.from_numpy(ply.read_columns(header, vertex, (*_NORMALS, *_SURFACE))))
+    if {*_NORMALS, *SURFACE} <= set(vertex.types):
+        gaussians = _with_surface(gaussians, torch.from_numpy(ply.read_columns(header, vertex, (*_NORMALS, *SURFACE))))
     return SceneFile(gaussians, metadata=header.metadata, notes=_unused(vertex))
 
 
@@ -68,7 +71,9 @@ def _with_surface(g: Gaussians, columns: Float[Tensor, "n 8"]) -> KnownSurface:
     emission = columns[:, 5:].contiguous()
     if not bool(((emission >= 0) & emission.isfinite()).all()):
         raise ValueError("expected a finite emission of 0 or more, found others")
-    return KnownSurface(**vars(g), normals=normals, metallic=material[:, 0], roughness=material[:, 1], emission=emission)
+    return KnownSurface(
+        **vars(g), normals=normals, metallic=material[:, 0], roughness=material[:, 1], emission=emission
+    )
 
 
 def _require_gaussians(vertex: ply.Element) -> tuple[str, ...]:
@@ -98,7 +103,7 @@ def write_gaussian_ply(path: Path, gaussians: Gaussians, metadata: SceneMetadata
     """Write the layout of the original code, byte for byte, atomically; metadata become comments."""
     n, k = gaussians.sh.shape[:2]
     rest = [f"f_rest_{i}" for i in range(3 * (k - 1))]
-    surface = _SURFACE if isinstance(gaussians, KnownSurface) else ()
+    surface = SURFACE if isinstance(gaussians, KnownSurface) else ()
     names = [*_MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATERNION, *surface]
     with atomic_write(path) as stream:
         ply.write_header(stream, ("vertex", n, [("float", name) for name in names]), metadata=metadata)

@@ -49,7 +49,7 @@ class SceneFile:
         g, metres = self.gaussians, self.metadata.metres_per_unit
         turned = "as in a .ply of structure from motion" if self.axes == "RDF" else "turned to RDF"
         words = ", ".join(f"{name} {_WORDS[letter]}" for name, letter in zip("xyz", self.axes, strict=True))
-        size = () if metres is None else (f"one unit is {metres:.4g} m by the file; store it by `splatgraft scale`",)
+        size = () if metres is None else (f"one unit is {metres:.4g} m by the file",)
         return (
             f"{g.count:,} Gaussians, SH degree {g.sh_degree}",
             *size,

@@ -167,6 +167,18 @@ def add_part(part, name, meshes):
     return thing
 
 
+def add_model(model):
+    """Import a .glb and return its meshes; it needs no other objects in Blender with the file's names."""
+    before = set(bpy.data.objects)
+    bpy.ops.import_scene.gltf(filepath=model["path"])
+    made = [thing for thing in bpy.data.objects if thing not in before]
+    for thing in made:
+        if thing.parent is None:
+            thing.location = Vector(model["location"]) + model["size"] * thing.location
+            thing.scale = model["size"] * thing.scale
+    return [thing for thing in made if thing.type == "MESH"]
+
+
 def _smooth(thing, part):
     if part["shape"] in _SMOOTH or part["bevel"] > 0:
         for polygon in thing.data.polygons:

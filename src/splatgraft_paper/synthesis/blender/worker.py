@@ -32,7 +32,8 @@ def _populate(job):
     for i, lamp in enumerate(job["scene"]["lamps"]):
         scene_things.append(scene_builder.add_lamp(lamp, f"lamp{i:02d}"))
     for key, parts in job["objects"].items():
-        things = [scene_builder.add_part(part, key, meshes) for part in parts]
+        is_model = isinstance(parts, dict)
+        things = scene_builder.add_model(parts) if is_model else [scene_builder.add_part(p, key, meshes) for p in parts]
         for i, thing in enumerate(things):
             thing.name = f"{key}_{i:03d}"
         objects[key] = things
