@@ -24,7 +24,7 @@ from splatgraft.core.images import read_rgb, write_image
 from splatgraft.core.posed_images import held_out
 from splatgraft.core.similarity import Similarity
 from splatgraft.evaluation import Truth
-from splatgraft.formats import read_cameras, read_capture, read_gaussians, write_capture
+from splatgraft.formats import read_cameras, read_capture, read_gaussians, read_scene, write_capture
 from splatgraft.project.step import perform
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.relighting import relight
@@ -41,6 +41,8 @@ from splatgraft_paper.synthesis.places import make_scene
 from splatgraft_paper.synthesis.scene import Camera, Place
 
 KINDS = ("matte", "glossy", "metal", "painted", "thin", "concave")
+VIEWS = 2  # held-out views of each scene
+BUDGET = 15_000  # Gaussians of a mesh, which is about 100 pixels wide in the pictures
 BLENDER_FROM_RDF = torch.tensor([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
 """Rotation from the axes in which a mesh is read to those in which Blender's importer places it."""
 
@@ -73,22 +75,23 @@ def reconstructed(folder: Path, work: Path) -> Gaussians:
     return read_gaussians(scene)
 
 
-def true_pictures(folder: Path, mesh: Path, out: Path, python: Path) -> tuple[Path, Path, list[int]]:
-    """Render the held-out views with and without the mesh; returns their folders and the views' numbers."""
+def true_pictures(folder: Path, meshes: Path, out: Path, python: Path) -> tuple[Path, list[int]]:
+    """Render held-out views without and with each mesh; returns the takes' folder and the views' numbers."""
     record = json.loads((folder / "scene.json").read_text())
     scene = make_scene(record["kind"], record["seed"])
-    place, count = scene.places[0], len(read_cameras(folder / "target"))
-    chosen = held_out(count, HELD_OUT_EVERY).nonzero()[:, 0].tolist()
-    takes = (Take("without", scene=True), Take("with", scene=True, object="object", passes=("color", "mask")))
-    rendered = out / "truth" / folder.name / mesh.stem
-    for take in takes:  # other views count as done; the first gives the exposure, as in the scene's own pictures
+    place, cameras = scene.places[0], read_cameras(folder / "target")
+    chosen = held_out(len(cameras), HELD_OUT_EVERY).nonzero()[:VIEWS, 0].tolist()
+    # the first take gives the exposure, as in the scene's own pictures
+    takes = [Take("without", scene=True)]
+    takes += [Take(kind, scene=True, object=kind, passes=("color", "mask")) for kind in KINDS]
+    rendered = out / "truth" / folder.name
+    for take in takes:  # other views count as done
         (rendered / take.name).mkdir(parents=True, exist_ok=True)
-        for index in set(range(count)) - set(chosen):
+        for index in set(range(len(cameras))) - set(chosen):
             (rendered / take.name / f"{index:04d}.done").touch()
-    placed = Model(str(mesh.resolve()), height_at(place), place.location)
-    job = Job(scene, {"object": placed}, _blender_cameras(read_cameras(folder / "target")), takes, SIZE.render)
-    render_job(job, rendered, python)
-    return rendered / "with", rendered / "without", chosen
+    models = {kind: Model(str((meshes / f"{kind}.glb").resolve()), height_at(place), place.location) for kind in KINDS}
+    render_job(Job(scene, models, _blender_cameras(cameras), tuple(takes), SIZE.render), rendered, python)
+    return rendered, chosen
 
 
 def _blender_cameras(cameras: Cameras) -> tuple[Camera, ...]:
@@ -108,16 +111,18 @@ def measured(folder: Path, work: Path, meshes: Path, out: Path, python: Path) ->
     record = json.loads((folder / "scene.json").read_text())
     place = make_scene(record["kind"], record["seed"]).places[0]
     at, found, notes = torch.tensor(place.location), {}, []
+    rendered, chosen = true_pictures(folder, meshes, out, python)
     for kind in KINDS:
-        shown, plain, chosen = true_pictures(folder, meshes / f"{kind}.glb", out, python)
         views = []
         for index in chosen:
-            image, without = (read_rgb(path / f"{index:04d}.png") for path in (shown, plain))
-            mask = read_rgb(shown / f"{index:04d}_mask.png")[..., 0]
+            image, without = (read_rgb(rendered / take / f"{index:04d}.png") for take in (kind, "without"))
+            mask = read_rgb(rendered / kind / f"{index:04d}_mask.png")[..., 0]
             drawn = render(target, cameras[index]).color[0].clamp(0, 1)
             views.append(TrueView(cameras[index], Truth(image=image, background=without, mask=mask), drawn))
         move = Similarity(height_at(place), BLENDER_FROM_RDF, at)
-        composite = compose(target, [read_gaussians(meshes / f"{kind}.glb")], target_from_objects=[move])
+        composite = compose(
+            target, [read_scene(meshes / f"{kind}.glb", mesh_budget=BUDGET).gaussians], target_from_objects=[move]
+        )
         scenes = {"pasted": composite.bake()[0]}
         for name, given in (("given", light), ("estimated", None)):
             relit = relight(composite, fitted, light=given)

@@ -36,7 +36,8 @@ class ExportOptions:
     layer: Layer = "all"
     """all: the whole scene; object: the relit object alone; scene: the place without object and shadow;
     scene-with-shadow: the place with the object's shadow and bounce, for those who draw the object itself as a mesh;
-    shadow: black Gaussians that darken a picture behind them as the shadow does; object-with-shadow: both, for a compositor."""
+    shadow: black Gaussians that darken a picture behind them as the shadow does; object-with-shadow: both, for a
+    compositor."""
     frame: Literal["auto", "capture", "world"] = "auto"
     """Frame of a scene. capture: as in the project; world: upright and in metres, as far as they are known; auto: world
     for .glb, which asks for it, else capture."""

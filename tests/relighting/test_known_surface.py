@@ -1,0 +1,141 @@
+"""Meshes in captured light: known albedo, normals, gloss and emission, in closed form."""
+
+import math
+
+import pytest
+import torch
+from shapes import ring, surfels
+
+from splatgraft.compositing.composite import Composite, PlacedObject
+from splatgraft.core.directions import even_directions
+from splatgraft.core.gaussians import Gaussians, KnownSurface
+from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.core.similarity import Similarity
+from splatgraft.core.spherical_harmonics import colors
+from splatgraft.relighting import Light, LightSource, RelightOptions, Relit, SourceScene, relight
+from splatgraft.relighting.light.light import fit_ambient
+from splatgraft.relighting.shading import KNOWN_LIGHTS
+
+WHOLE = RelightOptions(most_added=0.0, fitted_views=0)
+SUN = (0.36, 0.48, 0.8)
+QUARTER = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def ball(albedo=0.5, *, metallic=0.0, roughness=1.0, emission=0.0, count=1500) -> KnownSurface:
+    around = even_directions(count)
+    # as sampled from a mesh: flat discs of .65 spacings
+    flat = surfels(0.3 * around, around, width=0.65 * 0.3 * math.sqrt(4 * math.pi / count), srgb=float(_srgb(albedo)))
+    full = torch.full((count,), 1.0)
+    return KnownSurface(
+        **vars(flat),
+        normals=around,
+        metallic=metallic * full,
+        roughness=roughness * full,
+        emission=emission * torch.ones(count, 3),
+    )
+
+
+def _srgb(value: float) -> torch.Tensor:
+    return srgb_from_linear(torch.tensor(value))
+
+
+def floor() -> Gaussians:
+    x = torch.linspace(-2, 2, 40)
+    grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(grid), 1)
+    return surfels(torch.cat([grid, torch.zeros(len(grid), 1)], 1), up, width=0.06)
+
+
+def lit(thing: Gaussians, light: Light, *, rotation=None, source: SourceScene | None = None, height=1.5) -> Relit:
+    turn = torch.eye(3) if rotation is None else rotation
+    target = floor()
+    placed = PlacedObject(thing, Similarity(1.0, turn, torch.tensor([0.0, 0.0, height])))
+    composite = Composite(target, (placed,), torch.zeros(target.count, dtype=torch.bool))
+    return relight(composite, ring(), sources=[source], light=light, options=WHOLE)
+
+
+def sky(radiance: float, *sources: LightSource) -> Light:
+    return Light(sources, fit_ambient(torch.full((3,), radiance)))
+
+
+def shown(relit: Relit, towards: torch.Tensor) -> torch.Tensor:
+    """Return the linear colours of the object's Gaussians, seen from one direction far away."""
+    thing = relit.shaded().select(relit.is_object)
+    return linear_from_srgb(colors(thing.sh, -towards.expand(thing.count, 3)))
+
+
+def test_a_matt_ball_has_albedo_times_irradiance_over_pi():
+    sun = LightSource(SUN, (3.0, 3.0, 3.0), angular_radius_deg=0.3)
+    thing = ball(0.4)
+    relit = lit(thing, sky(0.2, sun))
+    found = shown(relit, torch.tensor([0.0, 0.0, 1.0]))[:, 0]
+    cosine = thing.normals @ torch.tensor(SUN)
+    want = 0.4 / math.pi * (0.2 * math.pi + 3 * cosine.clamp_min(0))
+    towards_sun = cosine > 0.3  # beyond, a shadow map's bias matters
+    # the ball is convex, and nothing else is near; the share of interreflection is in the settings
+    share = KNOWN_LIGHTS.floor
+    expected = (want + share * want.mean()) / (1 + share)
+    assert float((found / expected)[towards_sun].log2().abs().max()) < 0.15  # shadow maps of 256 pixels
+    assert float((found / expected)[towards_sun].mean()) == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.parametrize("kind", [{"metallic": 1.0}, {"metallic": 0.0}])
+@pytest.mark.parametrize("roughness", [0.2, 0.5, 0.9])
+def test_a_white_ball_in_a_white_sky_is_white(kind, roughness):
+    # the furnace test: a surface that absorbs nothing cannot be told from an even sky, from no view
+    relit = lit(ball(1.0, roughness=roughness, **kind), sky(0.5))
+    towards = torch.tensor([0.6, 0.0, 0.8])
+    facing = ball().normals @ towards > 0.3
+    found = shown(relit, towards)[facing]
+    # single lobes lose or gain energy: matt and Fresnel parts do not exactly add up to one
+    assert float(found.mean()) == pytest.approx(0.5, rel=0.06)
+    assert float(found.max()) < 0.65
+
+
+def test_metal_mirrors_the_sun_and_dark_lacquer_shows_only_its_highlight():
+    sun = LightSource(SUN, (0.5, 0.5, 0.5), angular_radius_deg=0.3)
+    towards = torch.tensor(SUN)
+    normals = ball().normals
+    middle, aside = normals @ towards > 0.97, (normals @ towards - 0.6).abs() < 0.1
+    for thing in (ball(0.9, metallic=1.0, roughness=0.5), ball(0.0, roughness=0.5)):
+        found = shown(lit(thing, sky(0.02, sun)), towards)[:, 0]
+        assert float(found[middle].mean()) > 3 * float(found[aside].mean())
+
+
+def test_emission_adds_to_reflected_light():
+    dark = shown(lit(ball(0.3), sky(0.2)), torch.tensor([0.0, 0.0, 1.0]))
+    glowing = shown(lit(ball(0.3, emission=0.25), sky(0.2)), torch.tensor([0.0, 0.0, 1.0]))
+    assert float((glowing - dark).mean()) == pytest.approx(0.25, abs=0.01)  # projection on bands
+
+
+def test_a_turned_mesh_keeps_its_light_and_turns_its_normals():
+    sun = LightSource(SUN, (2.0, 2.0, 2.0))
+    straight, turned = (lit(ball(), sky(0.2, sun), rotation=rotation) for rotation in (None, QUARTER))
+    place = straight.prepared[0].normals.vectors, turned.prepared[0].normals.vectors
+    torch.testing.assert_close(place[1], place[0] @ QUARTER.T)
+    nearest = torch.cdist(place[1], place[0]).argmin(1)
+    one, other = (relit.shade[relit.is_object][:, 0] for relit in (straight, turned))
+    assert float((other - one[nearest]).abs().median()) < 0.02 * float(one.mean())  # neighbours are 4 degrees apart
+
+
+def test_a_source_scene_does_not_change_a_known_surface():
+    light = sky(0.2, LightSource(SUN, (2.0, 2.0, 2.0)))
+    plain = lit(ball(), light)
+    with_source = lit(ball(), light, source=SourceScene(floor(), ring()))
+    assert torch.equal(plain.shade, with_source.shade)
+    assert any("mesh" in note.text for note in plain.report)
+    assert not any("unknown" in note.text for note in plain.report)
+
+
+def test_mesh_and_captured_object_stand_side_by_side():
+    target, known = floor(), ball(0.4)
+    captured = surfels(0.3 * even_directions(800), even_directions(800), width=0.03, srgb=0.5)
+    moves = [Similarity(1.0, torch.eye(3), torch.tensor([x, 0.0, 0.3])) for x in (-0.5, 0.5)]
+    objects = (PlacedObject(known, moves[0]), PlacedObject(captured, moves[1]))
+    composite = Composite(target, objects, torch.zeros(target.count, dtype=torch.bool))
+    relit = relight(composite, ring(), light=sky(0.2, LightSource(SUN, (2.0, 2.0, 2.0))), options=WHOLE)
+    assert relit.prepared[0].source_lighting is not None
+    assert relit.prepared[1].source_lighting is None
+    # the captured one keeps its mean brightness, the mesh does not
+    shade = relit.shade[relit.is_object]
+    assert float(shade[known.count :].log().mean()) == pytest.approx(0, abs=0.01)
