@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from splatgraft.composition import Placed, PlaceOptions, compose, place_object
     from splatgraft.consolidation import ConsolidateOptions, consolidate
     from splatgraft.core.cameras import Cameras, look_at, pinhole
-    from splatgraft.core.gaussians import Gaussians
+    from splatgraft.core.gaussians import Gaussians, KnownSurface
     from splatgraft.core.images import read_rgb as load_image
     from splatgraft.core.images import write_image as save_image
     from splatgraft.core.images import write_radiance as save_hdr
@@ -84,6 +84,7 @@ __all__ = [
     "Harmonizer",
     "HarmonizerContext",
     "HarmonizerInputs",
+    "KnownSurface",
     "LayerWeights",
     "LiftOptions",
     "Light",

@@ -49,7 +49,7 @@ def test_glb_with_metallic_roughness_vertex_colors_and_emission(tmp_path):
     assert torch.allclose(g.metallic, torch.tensor(0.1), atol=1e-6)
     assert torch.allclose(g.emission, torch.tensor([0, 0.5, 0]), atol=1e-6)
     # the file's metres, and up in the axes of a .ply
-    assert formats.read_scene(tmp_path / "a.glb", mesh_budget=9).metadata.metres_per_unit == 1
+    assert formats.read_scene(tmp_path / "a.glb", mesh_budget=50).metadata.metres_per_unit == 1
     # an open sheet has two sides of 4 square units each
     assert float((g.normals @ UP).abs().min()) > 0.999
     assert float((g.normals @ UP > 0).float().mean()) == pytest.approx(0.5, abs=0.1)
@@ -132,6 +132,15 @@ def test_points_are_even(tmp_path):
     assert float(alpha[50:110, 50:110].min()) > 0.98
 
 
+@pytest.mark.parametrize("thickness", [1e-3, 0.02])
+def test_the_two_faces_of_a_thin_board_do_not_change_sides(tmp_path, thickness):
+    vertices, faces = cube()
+    g = read(write_stl(tmp_path / "a.stl", vertices * np.float32([1, 1, thickness]), faces), budget=2000)
+    # z of the file is up
+    up = -g.normals[:, 1]
+    assert float((-g.means[:, 1] * up)[up.abs() > 0.9].min()) > 0
+
+
 def test_obj_with_materials_and_texture(tmp_path):
     path = write_obj(tmp_path)
     g = read(path)
@@ -190,7 +199,7 @@ def test_what_is_not_read_is_named_in_one_line(tmp_path, name):
 def test_glass_is_said_to_be_opaque(tmp_path):
     data = glb({"POSITION": QUAD}, np.array([[0, 2, 1]], np.uint16), extensionsUsed=["KHR_materials_transmission"])
     (tmp_path / "a.glb").write_bytes(data)
-    assert any("opaque" in sentence for sentence in formats.read_scene(tmp_path / "a.glb", mesh_budget=9).said())
+    assert any("opaque" in sentence for sentence in formats.read_scene(tmp_path / "a.glb", mesh_budget=50).said())
 
 
 def test_files_outside_of_the_folder_are_not_read(tmp_path):

@@ -75,8 +75,9 @@ def test_a_matt_ball_has_albedo_times_irradiance_over_pi():
     # the ball is convex, and nothing else is near; the share of interreflection is in the settings
     share = KNOWN_LIGHTS.floor
     expected = (want + share * want.mean()) / (1 + share)
-    assert float((found / expected)[towards_sun].log2().abs().max()) < 0.15  # shadow maps of 256 pixels
-    assert float((found / expected)[towards_sun].mean()) == pytest.approx(1, abs=0.03)
+    # 4% of the light are reflected by a wide lobe instead, which adds a twentieth of the light at most: 4% over .4 / 2
+    assert float((found / expected)[towards_sun].log2().abs().max()) < 0.15
+    assert float((found / expected)[towards_sun].mean()) == pytest.approx(1, abs=0.06)
 
 
 @pytest.mark.parametrize("kind", [{"metallic": 1.0}, {"metallic": 0.0}])

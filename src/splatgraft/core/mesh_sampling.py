@@ -29,6 +29,7 @@ _THICKNESS = 0.02  # standard deviation across a disc over the spacing
 _OPACITY = 0.99
 _INSET = 0.65  # distance of the discs from silhouettes and edges, which they would else overlap, spacings
 _APART = 0.1  # distance of the discs of an open part's two sides from the surface, spacings
+_RIM = 0.3  # largest share of a triangle's height over an edge that this empties
 _SHARP = math.cos(math.radians(30))  # cosine of half the angle between the normals of a ridge's sides
 _SAME_SIDE = 0.3  # smallest cosine between the normals of two points that exclude each other
 _DEGENERATE = 1e-9  # smallest area of a triangle over the square of the mesh's size
@@ -54,24 +55,26 @@ def sample_mesh(mesh: Mesh, *, budget: int = DEFAULT_BUDGET, seed: int = 0) -> K
     rows = (area > _DEGENERATE * size**2).nonzero()[0]
     if not len(rows):
         raise ValueError("expected triangles with an area, found none")
-    inverted, is_open, is_edge = _sides(mesh.corners[rows])
+    inverted, is_open, is_edge = (found[rows] for found in _sides(mesh.corners))
     # an open part appears twice, once with its triangles turned round
     triangle = np.concatenate([rows, rows[is_open]])
     sign = np.concatenate([np.where(inverted, -1.0, 1.0), np.full(int(is_open.sum()), -1.0)])
     rng = np.random.default_rng(seed)
     total = float(area[triangle].sum())
     which, weights = _drawn(area[triangle], _CANDIDATES * budget, rng)
-    at_edge = np.concatenate([is_edge, is_edge[is_open]])[which] & (
-        _edge_distances(mesh.corners[triangle], which, weights) < _INSET * math.sqrt(total / budget)
-    )
-    which, weights = (values[~at_edge.any(1)] for values in (which, weights))
+    opposite = np.roll(weights, 1, axis=1)  # the weight of the corner opposite to each edge
+    distance = opposite * _heights(mesh.corners[triangle])[which]
+    near = (distance < _INSET * math.sqrt(total / budget)) & (opposite < _RIM)
+    inside = ~(np.concatenate([is_edge, is_edge[is_open]])[which] & near).any(1)
+    which, weights = which[inside], weights[inside]
     facing = unit(across)[triangle[which]] * sign[which, None]
     points = np.einsum("nc,nci->ni", weights, mesh.corners[triangle[which]])
     kept = _spread(points, facing, radius=math.sqrt(_DENSITY * total / budget))[:budget]
     which, weights, points, facing = which[kept], weights[kept], points[kept], facing[kept]
     spacing = math.sqrt(total / len(kept))
     lifted = np.concatenate([is_open, np.ones(int(is_open.sum()), bool)])[which]
-    points = points + spacing * np.where(lifted, _APART, -_INSET)[:, None] * facing
+    shift = np.where(lifted, _APART * spacing, -_insets(points, facing, _INSET * spacing))
+    points = points + shift[:, None] * facing
     return _gaussians(mesh, triangle[which], weights, (points, facing, sign[which]), spacing)
 
 
@@ -114,14 +117,24 @@ def _sides(
     return is_inverted, is_open[part], (unpaired | (is_sharp & below))[at].reshape(-1, 3)
 
 
-def _edge_distances(
-    corners: Float[np.ndarray, "t 3 3"], which: Int[np.ndarray, "c"], weights: Float[np.ndarray, "c 3"]
-) -> Float[np.ndarray, "c 3"]:
-    """Compute the distances of points from the edges of their triangles."""
+def _heights(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3"]:
+    """Compute the heights of triangles over their edges."""
     edges = np.roll(corners, -1, axis=1) - corners
     double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1, keepdims=True)
-    heights = double_area / np.linalg.norm(edges, axis=2)
-    return np.roll(weights, 1, axis=1) * heights[which]  # the corner before edge i is opposite to it
+    return double_area / np.linalg.norm(edges, axis=2)
+
+
+def _insets(
+    points: Float[np.ndarray, "n 3"], facing: Float[np.ndarray, "n 3"], largest: float
+) -> Float[np.ndarray, "n"]:
+    """Compute how far points may move inwards: at most to 0.4 of the thickness where the part is thin."""
+    out = np.full(len(points), largest)
+    pairs = KDTree(points).query_pairs(2.5 * largest, output_type="ndarray")
+    pairs = pairs[np.einsum("pi,pi->p", facing[pairs[:, 0]], facing[pairs[:, 1]]) < -_SAME_SIDE]
+    for one, other in (pairs.T, pairs[:, ::-1].T):
+        depth = np.einsum("pi,pi->p", points[one] - points[other], facing[one])
+        np.minimum.at(out, one, np.where(depth > 0, 0.4 * depth, largest))
+    return out
 
 
 def _drawn(

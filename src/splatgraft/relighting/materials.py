@@ -116,6 +116,8 @@ class Materials:
     """Linear rgb under the old light, without the lobe."""
     share: Float[Tensor, "n"]
     """Share of the lobe in the colour under the old light, in [0, 1]."""
+    facing: Float[Tensor, "n"] | None = None
+    """Share of a dielectric's reflectance at normal incidence; None for `_FACING`."""
     emission: Float[Tensor, "n 3"] | None = None
     """Emitted linear rgb; None for none."""
 
@@ -136,18 +138,21 @@ def known_materials(surface: KnownSurface) -> Materials:
     """Represent metallic-roughness materials by lobes; sharper reflections than the sharpest lobe are blurred.
 
     The concentration of a GGX lobe around the mirrored direction is 1 / (2 alpha^2) (Wang et al. 2009). A rough
-    dielectric reflects less towards grazing views (Lagarde 2011); what its lobe lacks is matt.
+    dielectric reflects less towards grazing views (Lagarde 2011). What it does not reflect on average is matt.
     """
     albedo = linear_from_srgb(spherical_harmonics.rgb_from_dc(surface.sh[:, 0]).clamp(0, 1))
-    metal, rough = surface.metallic[:, None], surface.roughness[:, None]
+    metal = surface.metallic[:, None]
+    grazing = (1 - surface.roughness).clamp_min(_FACING)
+    mean = _FACING + (grazing - _FACING)[:, None] / 21  # integral of Schlick's approximation over the hemisphere
     sharpness = -math.log(2) - 4 * surface.roughness.clamp_min(0.05).log()
     lobes = torch.tensor(_CONCENTRATIONS)
     return Materials(
-        reflectance=torch.where(metal > 0.5, metal * albedo + _FACING * (1 - metal), 1 - rough),
+        reflectance=torch.where(metal > 0.5, metal * albedo + _FACING * (1 - metal), grazing[:, None]),
         concentration=lobes[(sharpness[:, None] - lobes.log()).abs().argmin(1)],
         dielectric=surface.metallic <= 0.5,
-        matt=(1 - metal) * ((1 - _FACING) * albedo + _FACING * rough),
+        matt=(1 - metal) * (1 - mean) * albedo,
         share=torch.zeros(surface.count),
+        facing=_FACING / grazing,
         emission=surface.emission,
     )
 
@@ -225,16 +230,17 @@ def lobe_radiance(
         which = ((concentration == value) & (reflectance > 0).any(1)).nonzero()[:, 0]
         if len(which):
             part = here.select(which).radiance(mirrored[which], value)
+            facing = _FACING if materials.facing is None else materials.facing[rows][which][:, None]
             factor = torch.where(
                 materials.dielectric[rows][which][:, None],
-                _schlick(cosine[which], _FACING),
+                _schlick(cosine[which], facing),
                 torch.ones(()),
             )
             out[which] = part * factor[..., None] * reflectance[which][:, None]
     return out
 
 
-def _schlick(cosine: Float[Tensor, "m v"], facing: float) -> Float[Tensor, "m v"]:
+def _schlick(cosine: Float[Tensor, "m v"], facing: float | Float[Tensor, "m 1"]) -> Float[Tensor, "m v"]:
     return facing + (1 - facing) * (1 - cosine.clamp(0, 1)) ** 5
 
 

@@ -62,7 +62,7 @@ def _check_extensions(content: dict[str, Any]) -> tuple[str, ...]:
 
 def _corners(gltf: Gltf, primitive: dict[str, Any]) -> Int[np.ndarray, "t 3"]:
     """Return the vertices of each triangle."""
-    vertices = gltf.content["accessors"][primitive["attributes"]["POSITION"]]["count"]
+    vertices = len(gltf.values(primitive["attributes"]["POSITION"], "VEC3"))
     index = np.arange(vertices)
     if "indices" in primitive:
         index = gltf.values(primitive["indices"], "SCALAR")[:, 0].astype(np.int64)
