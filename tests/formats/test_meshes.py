@@ -1,12 +1,17 @@
 """Meshes as scenes: geometry, materials and textures of each format, refused files, and the cover of the surface."""
 
+import io
 import json
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
 from mesh_files import QUAD, cube, glb, picture, textured_quad, write_obj, write_ply, write_stl
+from PIL import Image
+from test_damaged_files import DERANDOMIZED, FEW, anything, assert_refused
 
 from splatgraft import formats
 from splatgraft.core.cameras import look_at, pinhole
@@ -225,3 +230,41 @@ def test_a_huge_stride_of_zero_takes_no_memory(tmp_path):
     text += b" " * (-len(text) % 4)
     with pytest.raises(ValueError, match="byteStride"):
         read(tmp_path / "a.glb", data[:12] + struct.pack("<2I", len(text), 0x4E4F534A) + text + data[20 + length :])
+
+
+def test_a_texture_of_too_many_pixels_is_refused(tmp_path):
+    stream = io.BytesIO()
+    Image.new("1", (9000, 9000)).save(stream, "PNG")
+    material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    with pytest.raises(ValueError, match="found 9000 x 9000"):
+        read(tmp_path / "a.glb", textured_quad(material, stream.getvalue()))
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("seeds")
+    vertices, faces = cube()
+    write_obj(folder)
+    write_stl(folder / "a.stl", vertices, faces)
+    write_ply(folder / "a.ply", vertices, faces)
+    material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    (folder / "a.glb").write_bytes(textured_quad(material, picture(np.zeros((4, 4, 3)))))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["a.glb", "two.obj", "two.mtl", "a.stl", "a.ply"])
+@given(damage=anything)
+@settings(max_examples=FEW, **DERANDOMIZED)
+def test_damaged(seeds, name, damage):
+    whole = (seeds / name).read_bytes()
+    (seeds / name).write_bytes(damage(whole))
+    tracemalloc.start()
+    try:
+        formats.read_scene(seeds / ("two.obj" if name == "two.mtl" else name), mesh_budget=50)
+    except ValueError as error:
+        assert_refused(str(error), seeds)
+    finally:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        (seeds / name).write_bytes(whole)
+    assert peak < 64 << 20  # trimesh itself takes 20 MB when it is first imported
