@@ -175,7 +175,9 @@ def prepare_object(
         received = torch.full((gaussians.count, 3), math.pi)  # of white light
         lighting = SourceLighting(old, received, known_materials(gaussians), None)
         notes.append(
-            Note(f"Object {number} has a known surface, as meshes do.{_gloss_note(lighting.materials, gaussians)}")
+            Note(
+                f"Object {number} is a mesh: its shape and material are known.{_gloss_note(lighting.materials, gaussians)}"
+            )
         )
     elif isinstance(old, Light) and source is not None:
         turned = old.rotated(placed.target_from_object.rotation)
