@@ -187,7 +187,7 @@ REFUSED = {
     "draco": ({"extensionsRequired": DRACO, "extensionsUsed": DRACO}, "draco"),
     "unknown": ({"extensionsRequired": ["EXT_other"]}, "EXT_other"),
     "skin": ({"node": {"skin": 0}}, "skin"),
-    "cycle": ({"nodes": [{"children": [0]}]}, "twice"),
+    "cycle": ({"nodes": [{"children": [0]}]}, "without cycles"),
     "no triangles": ({"primitive": {"mode": 0}}, "without triangles"),
 }
 

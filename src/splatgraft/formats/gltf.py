@@ -70,7 +70,7 @@ class Gltf:
         while waiting:
             index, parent = waiting.pop(0)
             if index in met:
-                raise ValueError(f"expected a tree of nodes, found node {index} twice")
+                raise ValueError(f"expected nodes without cycles, found node {index} twice")
             met.add(index)
             node = content["nodes"][index]
             if "skin" in node:
