@@ -35,6 +35,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_the_whole_mesh_is_the_object_and_has_its_own_size(project: Path):
     object_ = read_gaussians(project / "object" / "object.ply")
     assert isinstance(object_, KnownSurface)
@@ -49,6 +50,7 @@ def test_the_whole_mesh_is_the_object_and_has_its_own_size(project: Path):
     assert "unknown" not in text
 
 
+@pytest.mark.long
 def test_a_placement_names_meshes_beside_the_own_object(project: Path, tmp_path: Path):
     file = json.loads((project / "composite" / "placement.json").read_text())
     own = file["objects"][0]
@@ -64,6 +66,7 @@ def test_a_placement_names_meshes_beside_the_own_object(project: Path, tmp_path:
     assert "Object 2 is a mesh" in text
 
 
+@pytest.mark.long
 def test_the_scene_with_the_shadow_is_exported_with_its_light(project: Path, tmp_path: Path):
     out = tmp_path / "ground.ply"
     assert main(["export", str(project), "--to", str(out), "--layer", "scene-with-shadow"]) == 0
@@ -84,6 +87,7 @@ def test_a_mesh_does_not_receive_objects(tmp_path: Path, capsys: pytest.CaptureF
     assert "found a mesh" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_cameras_of_a_mesh_look_at_it_from_above(project: Path):
     eyes = read_cameras(project / "source" / "capture").centers
     assert float(eyes[:, 1].max()) < 0

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -68,19 +69,19 @@ class Gaussians:
         half = self.rotations * self.scales[:, None, :]
         return half @ half.transpose(1, 2)
 
-    def select(self, which: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> "Gaussians":
+    def select(self, which: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> Self:
         """Select the Gaussians where the mask is true, or those at the given indices, in their order."""
         return self.map(lambda tensor: tensor[which])
 
-    def map(self, function: Callable[[Tensor], Tensor]) -> "Gaussians":
+    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
         """Apply `function` to every tensor."""
         return replace(self, **{field.name: function(getattr(self, field.name)) for field in fields(self)})
 
-    def to(self, device: torch.device | str) -> "Gaussians":
+    def to(self, device: torch.device | str) -> Self:
         """Move the Gaussians to `device`."""
         return self.map(lambda tensor: tensor.to(device))
 
-    def with_sh_degree(self, degree: int) -> "Gaussians":
+    def with_sh_degree(self, degree: int) -> Self:
         """Cut off higher bands, or pad with zeros."""
         return replace(self, sh=spherical_harmonics.with_degree(self.sh, degree))
 

@@ -174,11 +174,8 @@ def prepare_object(
         (visible,) = self_visibility(gaussians, sphere, normals.vectors, (samples,))
         received = torch.full((gaussians.count, 3), math.pi)  # of white light
         lighting = SourceLighting(old, received, known_materials(gaussians), None)
-        notes.append(
-            Note(
-                f"Object {number} is a mesh: its shape and material are known.{_gloss_note(lighting.materials, gaussians)}"
-            )
-        )
+        gloss = _gloss_note(lighting.materials, gaussians)
+        notes.append(Note(f"Object {number} is a mesh: its shape and material are known.{gloss}"))
     elif isinstance(old, Light) and source is not None:
         turned = old.rotated(placed.target_from_object.rotation)
         old_samples = sample_light(turned)

@@ -144,8 +144,9 @@ class _Materials:
         if source not in self._images:
             self._images[source] = self._image(self._gltf.content["images"][source])
         sampler = self._gltf.content["samplers"][texture["sampler"]] if "sampler" in texture else {}
-        wraps = [_WRAPS[sampler.get(name, 10497)] for name in ("wrapS", "wrapT")]
-        return _transformed(Texture(self._images[source], (wraps[0], wraps[1])), transform)
+        across: Wrap = _WRAPS[sampler.get("wrapS", 10497)]
+        down: Wrap = _WRAPS[sampler.get("wrapT", 10497)]
+        return _transformed(Texture(self._images[source], (across, down)), transform)
 
     def _image(self, image: dict[str, Any]) -> np.ndarray:
         data = self._gltf.view(image["bufferView"]) if "bufferView" in image else read_uri(self._path, image["uri"])

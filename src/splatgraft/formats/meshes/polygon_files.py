@@ -32,7 +32,8 @@ def read_polygons(path: Path) -> tuple[Mesh, tuple[str, ...]]:
 
     if (size := path.stat().st_size) > _MAX_BYTES:
         raise ValueError(f"expected at most {_MAX_BYTES >> 30} GiB, found {size / 2**30:.1f} GiB")
-    suffix, beside = path.suffix.lower(), _Beside(path)
+    suffix = path.suffix.lower()
+    beside: Any = _Beside(path)  # trimesh's own resolver would read files anywhere
     with path.open("rb") as stream:
         scene = trimesh.load_scene(stream, file_type=suffix[1:], resolver=beside, process=False)
     found = [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
