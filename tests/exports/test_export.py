@@ -49,6 +49,7 @@ def test_a_project_knows_its_layers_its_frame_and_its_name(source):
     p = parts()
     assert same(layer_of(source, "object")[0], p["relit"])
     assert same(layer_of(source, "scene")[0], p["place"])
+    assert same(layer_of(source, "scene-with-shadow")[0], p["shadowed"])
     assert source.pasted is not None
     assert source.pasted.count == source.scene.count == p["place"].count + p["object"].count
     assert source.title == "A ball on a plane"
