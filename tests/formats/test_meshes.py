@@ -4,6 +4,7 @@ import io
 import json
 import struct
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from splatgraft.core.cameras import look_at, pinhole
 from splatgraft.core.gaussians import KnownSurface
 from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.similarity import Similarity
-from splatgraft.core.spherical_harmonics import rgb_from_dc
+from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.rendering import render
 
 UP = torch.tensor([0.0, -1.0, 0.0])
@@ -144,6 +145,16 @@ def test_the_two_faces_of_a_thin_board_do_not_change_sides(tmp_path, thickness):
     # z of the file is up
     up = -g.normals[:, 1]
     assert float((-g.means[:, 1] * up)[up.abs() > 0.9].min()) > 0
+
+
+def test_the_sides_of_a_sheet_do_not_show_through_each_other(tmp_path):
+    g = read(tmp_path / "a.glb", textured_quad({}), budget=4000)
+    is_top = (g.normals @ UP > 0).float()
+    marked = replace(g, sh=dc_from_rgb(is_top[:, None, None].expand(-1, 1, 3).contiguous()))
+    camera = pinhole(look_at(torch.tensor([[0.0, -2.0, -2.0]]), torch.zeros(3), UP), 150.0, width=120, height=90)
+    drawn = render(marked, camera)
+    # 45 degrees above the sheet
+    assert float(drawn.color[0][..., 0][drawn.alpha[0] > 0.95].mean()) > 0.9
 
 
 def test_obj_with_materials_and_texture(tmp_path):
