@@ -175,7 +175,8 @@ def measure_in_browser(project: Path) -> dict[str, float]:
         )  # fmt: skip
         page, start = context.new_page(), time.monotonic()
         page.goto(address)
-        page.wait_for_function("(document.body.dataset.picture || '').includes('full full quality')", timeout=0)
+        while "full full quality" not in (page.evaluate("document.body.dataset.picture") or ""):
+            page.wait_for_timeout(20)
         found["browser: finished picture"] = time.monotonic() - start
         page.wait_for_timeout(1500)
         number = "Number(document.body.dataset.picture.split(' ')[0])"

@@ -158,6 +158,10 @@ class Client:
         count = len(self.heads)
         self.wait(lambda: len(self.heads) > count and self.head["full"], what="a picture of full size")
 
+    def shows(self, step: str) -> None:
+        """Wait for a picture of full size of a step."""
+        self.wait(lambda: self.head.get("step") == step and self.head["full"], what=f"a picture of {step}")
+
     def closed_with(self) -> tuple[int | None, str | None]:
         """Read until the server closes the window."""
         with suppress(ConnectionClosed):

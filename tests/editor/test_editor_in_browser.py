@@ -34,8 +34,14 @@ class Page:
         words = (self.page.evaluate("document.body.dataset.picture") or "0 none").split()
         return int(words[0]), words[1] == "full"
 
-    def rests(self, after: int = 0) -> None:
-        self.until(lambda: self.picture()[0] > after and self.picture()[1], "a picture of full size")
+    def rests(self) -> None:
+        """Wait until the page shows the present state in full size."""
+
+        def does() -> bool:
+            view = self.editor.editing()
+            return view is not None and view.drawn == (view.version, 1.0) and self.picture() == (view.sent, True)
+
+        self.until(does, "a picture of full size")
 
     def drag(self, start: tuple[float, float], by: tuple[float, float]) -> None:
         mouse = self.page.mouse
@@ -63,13 +69,11 @@ def test_a_user_s_story(shown: Page, project: Path) -> None:
     # the view turns by a drag beside the object
     view = editor.editing()
     assert view is not None
-    before, number = view.orbits["target"], shown.picture()[0]
+    before = view.orbits["target"]
     shown.drag((60.0, 60.0), (90.0, 20.0))
     shown.until(lambda: view.orbits["target"] is not before, "the turned view")
-    shown.rests(number)
     page.keyboard.press("Home")
     shown.until(lambda: view.photo == 0, "the first view")
-    page.wait_for_timeout(300)
     shown.rests()
     # the object moves by a drag on it, and one undo takes it back
     placed = session.objects()[0].target_from_object.translation
@@ -97,7 +101,7 @@ def test_a_user_s_story(shown: Page, project: Path) -> None:
     # keys change the step, but not while something is typed
     page.keyboard.press("2")
     shown.until(lambda: editor.step == "Select", "the step Select")
-    shown.rests(shown.picture()[0] - 1)
+    shown.rests()
     page.click("#steps button[data-step=Share]")
     shown.until(lambda: editor.step == "Share", "the step Share")
     assert not shown.errors

@@ -117,8 +117,8 @@ def test_a_project_is_started_only_of_two_usable_paths_which_a_list_of_folders_g
         for index in range(8):
             address = f"/upload?window={number}&name=photos_7/{index}.png&use=upload_target"
             assert window.request("POST", address, photo + bytes([index]))[0] == 200
-        window.says("8 photos")
-        assert window.control("target")["value"] == str(tmp_path / "new" / "uploads" / "photos_7")
+        uploaded = str(tmp_path / "new" / "uploads" / "photos_7")
+        window.wait(lambda: window.control("target")["value"] == uploaded, what="the folder of the photos")
 
 
 def test_an_opened_project_shows_how_its_scenes_are_viewed(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -279,7 +279,7 @@ def test_a_missing_mask_is_said_and_the_photo_is_shown(finished_project: Path, t
     with opened_editor(folder / "project.toml") as editor, Client(editor.server.port).window(size=(300, 200)) as window:
         window.step("Select")
         window.says(f"Mask {masks[2].name} is missing.")
-        window.finished()
+        window.shows("Select")
         assert not window.head["problem"]
         assert window.pixels.std() > 5
 
@@ -302,6 +302,11 @@ def test_clicks_preview_an_outline_and_alt_marks_the_background(finished_project
         assert session.state.prompts is not None
         (prompt,) = session.state.prompts.values()
         assert (len(prompt.inside), len(prompt.outside)) == (1, 1)
+        # the place is shown although there is no object to place yet
+        window.step("Place")
+        window.shows("Place")
+        assert window.pixels.std() > 5
+        assert not window.head["problem"]
 
 
 def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(project: Path) -> None:

@@ -200,8 +200,12 @@ def lit(project: Path) -> Iterator[tuple[Editor, Client]]:
 
 
 def same_picture(editor: Editor, window: Client, tolerance: float) -> None:
-    """Assert that the last picture is the renderer's own, scaled."""
+    """Assert that the picture at rest is the renderer's own, scaled."""
     view, pictures = editor.editing(), editor.pictures
+    # messages are taken in their order: a picture of another size comes behind all of them
+    wanted = 242 if window.pixels.shape[1] != 242 else 240
+    window.send("size", w=wanted, h=160)
+    window.wait(lambda: window.pixels.shape[1] == wanted and window.head["full"], what="the picture at rest")
     assert view is not None
     assert pictures is not None
     orbit = editor.orbit(view)
@@ -253,6 +257,15 @@ def test_pictures_of_orbit_drag_and_release_are_the_renderer_s_and_end_as_the_st
 
 def test_the_divider_shows_the_picture_before_on_its_left(window: Client) -> None:
     window.send("size", w=200, h=120)
+    window.finished()
+    first = window.pixels
+    # the opening view is the first photo's, to which Home leads back
+    window.send("turn", x=0.2, y=0.1)
+    window.finished()
+    assert bool((window.pixels != first).any())
+    window.send("key", key="home")
+    window.finished()
+    assert np.array_equal(window.pixels, first)
     window.do("before", "Place alone")
     window.do("kind", "Pasted, unlit")
     window.wait(lambda: window.control("before")["value"] == "Place alone", what="the choice")

@@ -50,6 +50,8 @@ KINDS: dict[str, Kind] = {
 _POLL_SECONDS = 0.4
 _MARK_SECONDS = 1.0  # how long nothing must change before the steps are marked anew
 _CURRENT, _DONE, _STALE, _NEXT = "●", "✓", "↻", "›"
+_WORDS = {"do": "id", "live": "id", "key": "key", "step": "to"}
+"""Kinds of messages about the panel, with the field that names something."""
 _MAX_ACTIONS = 200  # messages that wait
 _UPLOADS_FOLDER = "uploads"
 _GREY = 48  # of a picture that cannot be drawn, 0 to 255
@@ -241,7 +243,7 @@ class Editor:
         except (ValueError, OSError) as error:
             problem, caption = " ".join(str(error).split()), ""
             pixels = np.full((camera.height, camera.width, 3), _GREY, np.uint8)
-        return pixels, over | {"caption": caption, "problem": problem}
+        return pixels, over | {"caption": caption, "problem": problem, "step": self.step}
 
     def draw_target(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
         """The target as it is chosen, with the picture before left of the divider, and the caption."""
@@ -255,7 +257,7 @@ class Editor:
                 if KINDS[name] == "photo":
                     parts.append(pictures.draw("photo", state, camera, view.photo)[:, left:right])
                 else:
-                    parts.append(pictures.draw(KINDS[name], state, part))
+                    parts.append(pictures.draw(KINDS[name], state, part, is_dragged=self.live is not None))
         caption = "full quality"
         if kind in ("lit", "shadow") and state.objects:
             stage = pictures.lit.stage(state)
@@ -367,6 +369,8 @@ class Editor:
         """Draw for a new window."""
         self.stream.add(View(window))
         self._send_panel()
+        with contextlib.suppress(queue.Full):
+            self._actions.put_nowait((window, {"t": "opened"}))
 
     def closed(self, window: Window) -> None:
         """Draw for it no more; the next oldest edits."""
@@ -380,9 +384,12 @@ class Editor:
             return
         if kind in ("size", "ack", "turn", "pan", "zoom", "split"):
             getattr(self, f"_take_{kind}")(view, message)
-        elif kind not in ("do", "live", "pointer", "key", "step"):
-            raise ValueError("expected a known kind")
-        elif view is self.editing():
+            return
+        if kind == "pointer":
+            Pointer.of(message)
+        elif not isinstance(message[_WORDS[kind]], str):
+            raise ValueError("expected a name")
+        if view is self.editing():
             if kind == "pointer" and message["what"] == "move":
                 waits, self._moves = self._moves is not None, message
                 if waits:
@@ -449,12 +456,15 @@ class Editor:
 
     def _take_action(self, view: View, message: dict[str, Any]) -> None:
         is_move = message["t"] == "live" or (message["t"] == "pointer" and message["what"] == "move")
-        if self.is_bad and not is_move:
+        if self.is_bad and not is_move and message["t"] != "opened":
             self.say("")  # an error holds until the next action
         with self.reported():
             getattr(self, f"_do_{message['t']}")(view, message)
         if not is_move:
             self.refresh()
+
+    def _do_opened(self, view: View, message: dict[str, Any]) -> None:
+        """What is only computed for a window follows: the light."""
 
     def _do_do(self, view: View, message: dict[str, Any]) -> None:
         if not self._form.offers(message["id"], message.get("value")):
@@ -535,9 +545,6 @@ class Editor:
             self.is_unsaved = self.is_unsaved or disk_full(error)
             line = os_error_line(error) if isinstance(error, OSError) else str(error)
             self.say(_FULL_DISK if disk_full(error) else line, bad=True)
-        except (KeyError, TypeError) as error:  # a message that no page sends
-            self.say(f"expected a message of this page ({type(error).__name__})", bad=True)
-            traceback.print_exc()
         except Exception as error:  # a programming error must be visible and must not end the page
             traceback.print_exc()
             self.say(f"{type(error).__name__}: {error} (traceback in the terminal)", bad=True)

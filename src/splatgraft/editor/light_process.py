@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import IO, Any, Literal
 
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import RelitPreview
@@ -73,7 +73,9 @@ class LightProcess:
                 name: getattr(state, name) for name in _FIELDS if self._sent.get(name, self) is not getattr(state, name)
             }
             self._number, self._wanted = self._number + 1, "final" if final else "draft"
-            self._asked = {number: asked for number, asked in self._asked.items() if number > self._number - _REMEMBERED}
+            self._asked = {
+                number: asked for number, asked in self._asked.items() if number > self._number - _REMEMBERED
+            }
             self._asked[self._number] = state
             try:
                 _write(self._child.stdin, (self._number, changed, final))
@@ -121,7 +123,7 @@ class LightProcess:
 class _Computing:
     """The other side: two threads, so that a draft does not wait for the light of an earlier state."""
 
-    def __init__(self, project: Project, out: BinaryIO) -> None:
+    def __init__(self, project: Project, out: IO[bytes]) -> None:
         files = project.files()
         assert files is not None
         self._project, self._out = project, out
@@ -185,14 +187,14 @@ def main(arguments: list[str]) -> None:
     os._exit(0)  # kernels may still run
 
 
-def _write(stream: BinaryIO, message: object) -> None:
+def _write(stream: IO[bytes], message: object) -> None:
     content = pickle.dumps(message, protocol=5)
     stream.write(len(content).to_bytes(8, "little"))
     stream.write(content)
     stream.flush()
 
 
-def _read(stream: BinaryIO) -> Any:
+def _read(stream: IO[bytes]) -> Any:
     """The next message of the other process, which this program started; None at the end."""
     head = stream.read(8)
     content = stream.read(int.from_bytes(head, "little")) if len(head) == 8 else b""

@@ -208,7 +208,7 @@ class OpenPanel(Panel):
         scene = (files.source_scene, files.target_scene)[index]
         cameras = (files.source_cameras, files.target_cameras)[index]
         if not scene.is_file():
-            return f"{name}: ready: camera positions will be found and the scene built"
+            return f"{name}: not built yet"
         text = f"{name}: ready"
         if files.without_photos[index] and cameras.is_file():
             made = session.scenes.cameras(cameras)

@@ -55,7 +55,9 @@ class Pointer:
         # a pointer may leave the canvas, and no number is too large for a message
         if not all(-10 < value < 10 for value in (x, y, u, v)):
             raise ValueError("pointer: expected a place near the canvas, found another")
-        words = [str(message.get(name, ""))[:40] for name in ("what", "on", "mode")]
+        words = [message.get(name, "") for name in ("what", "on", "mode")]
+        if not all(isinstance(word, str) for word in words):
+            raise ValueError("pointer: expected words, found others")
         return Pointer(words[0], x, y, words[1], words[2], bool(message.get("alt")), bool(message.get("shift")), (u, v))
 
     @property

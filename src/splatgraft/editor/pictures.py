@@ -3,6 +3,7 @@
 An object that was moved since keeps the colours of its last lit place, over a contact shadow of its footprint.
 """
 
+import math
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,6 +42,7 @@ _DARKEST, _SHADOW_WIDTH = (
     0.5,
     0.35,
 )  # of a contact shadow: share of the light that it takes; its width over the object's radius
+_NO_TURN = 1e-5  # largest entry of a rotation over the identity's that rounding makes
 _FOOT_SHARE, _FOOT_POINTS = 0.2, 200  # part of an object's height that counts as its foot; its points
 
 
@@ -115,16 +117,14 @@ class LitScenes:
         now = self._now
         return now.relit if now is not None and now.fits(state) else None
 
-    def scene(self, state: EditState) -> Gaussians:
-        """The scene of a state with the newest colours."""
+    def scene(self, state: EditState, *, is_dragged: bool = False) -> Gaussians:
+        """The scene of a state with the newest colours; in a drag the support is not flattened under the objects."""
         now = self._now
         if not self._scenes.files.transfers_light or not state.objects:
             return self.pasted(state)
-        if now is None:
-            return self._moved(None, state)
-        if now.stands_as(state):
+        if now is not None and now.stands_as(state):
             return self._baked(now, state.weights)[0]
-        return self._moved(now, state)
+        return self._moved(now, state, self.place(state) if is_dragged else self._flattened(state))
 
     def pasted(self, state: EditState) -> Gaussians:
         """The scene that the step `compose` writes."""
@@ -155,8 +155,14 @@ class LitScenes:
             return lit.baked
         return self._memo.get("baked", (relit, weights), lambda: relit.bake(weights))
 
-    def _moved(self, lit: _LitState | None, state: EditState) -> Gaussians:
-        """The objects at other places than where they were lit last."""
+    def _flattened(self, state: EditState) -> Gaussians:
+        """The target, with the layers flattened that the objects stand on, which takes longer than a picture."""
+        composite = self._scenes.composite(state)
+        count = composite.kept_count
+        return self._memo.get("flattened", (composite,), lambda: composite.merged()[0].map(lambda rows: rows[:count]))
+
+    def _moved(self, lit: _LitState | None, state: EditState, place: Gaussians) -> Gaussians:
+        """The objects at other places of the target than where they were lit last."""
         objects = list(state.objects or ())
         parts = self._lit_objects(lit, state.weights) if lit is not None else {}
         moved, feet = [], []
@@ -166,11 +172,10 @@ class LitScenes:
             if own:
                 number = index if index in own else own[0]
                 _, before, gaussians = parts[number]
-                moved.append((move @ before.inverse()).gaussians(gaussians))
+                moved.append(_moved_by(move @ before.inverse(), gaussians))
             else:
                 moved.append(move.gaussians(self._scenes.gaussians(path)))
             feet.append((move.points(self._foot(item)), move.scale * self._scenes.placeable_object(item).base.radius))
-        place = self.place(state)
         scene = concatenate([place, *moved])
         for points, radius in feet:
             _darken(scene.sh, place, points, radius)  # of the new scene alone
@@ -204,6 +209,14 @@ class LitScenes:
         return self._scenes.derive(f"foot {self._scenes.object_path(item)}", (one,), make)
 
 
+def _moved_by(move: Similarity, gaussians: Gaussians) -> Gaussians:
+    """The Gaussians at another place; without a turn their colours need no rotation, which takes longest."""
+    if float((move.rotation - torch.eye(3)).abs().max()) > _NO_TURN:
+        return move.gaussians(gaussians)
+    log_scales = gaussians.log_scales + math.log(move.scale)
+    return replace(gaussians, means=move.points(gaussians.means), log_scales=log_scales)
+
+
 def _same_weights(a: EditState, b: EditState) -> bool:
     return a.weights == b.weights
 
@@ -229,22 +242,20 @@ class Pictures:
         self._scenes, self.lit, self._memo = scenes, LitScenes(scenes), Memo()
 
     def draw(
-        self, kind: Kind, state: EditState, camera: Cameras, photo: int | None = None
+        self, kind: Kind, state: EditState, camera: Cameras, photo: int | None = None, *, is_dragged: bool = False
     ) -> UInt8[np.ndarray, "h w 3"]:
         """Draw the target; ValueError where what is needed does not exist yet."""
         if kind == "photo":
             return self._target_photo(camera, photo)
         if kind == "shadow":
             return self._shadow(state, camera)
-        return draw(self._scene(kind, state), camera)
+        return draw(self.lit.scene(state, is_dragged=is_dragged) if kind == "lit" else self._scene(kind, state), camera)
 
     def _scene(self, kind: Kind, state: EditState) -> Gaussians:
         if kind == "result":
             if not self._scenes.files.result.is_file():
                 raise ValueError("There is no result yet: press Update result in Run.")
             return self._scenes.gaussians(self._scenes.files.result)
-        if kind == "lit":
-            return self.lit.scene(state)
         return self.lit.pasted(state) if kind == "pasted" else self.lit.place(state)
 
     def _shadow(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
@@ -269,9 +280,7 @@ class Pictures:
 
     def source_photo(self, index: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
         """A photo of the source, upright and at most 1920 pixels long, and its own width and height."""
-        # not by the capture, which cannot be read where too many masks are missing
-        cameras = self._scenes.files.source_cameras
-        path = cameras.parent / self._scenes.cameras(cameras).names[index]
+        path = self._scenes.photo(self._scenes.files.source_cameras, index)
         stamp = path.stat().st_mtime_ns if path.is_file() else 0
         return self._scenes.derive("photo", (str(path), stamp), lambda: read_upright(path, _LONGEST_PX))
 

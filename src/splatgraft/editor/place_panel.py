@@ -14,6 +14,7 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.editor.drag import Drag, DragMode, outline
 from splatgraft.editor.form import Form
 from splatgraft.editor.panel import CORNERS, BoxDrag, Panel, Pointer, box_over, view_camera
+from splatgraft.editor.pictures import same_places
 from splatgraft.editor.placement import (
     Gizmo,
     ObjectSize,
@@ -366,10 +367,7 @@ class PlacePanel(Panel):
             self._drag = None
             # the very state that was shown, so that its light holds
             shown = self.editor.live
-            is_shown = (
-                shown is not None and shown.objects is not None and shown.objects[index].target_from_object == placed
-            )
-            session.change(shown if is_shown and shown is not None else edited)
+            session.change(shown if shown is not None and same_places(shown.objects, edited.objects) else edited)
             self.editor.show_live(None)
         else:
             self.editor.show_live(edited)

@@ -51,15 +51,14 @@ class SceneCache:
         """The posed images whose cameras are in a file."""
         return self._read("capture", path, lambda path: read_capture(path.parent))
 
-    def missing_masks(self, path: Path) -> tuple[Path, ...]:
+    def photo(self, path: Path, index: int) -> Path:
+        """The photo of a camera; the capture, which names it too, cannot be read where too many masks are missing."""
+        return self._read("photos", path, lambda path: _named(path, "file_path"))[index] or path
+
+    def missing_masks(self, path: Path) -> list[Path]:
         """The masks that a transforms.json names, and that do not exist."""
-
-        def named(path: Path) -> tuple[Path, ...]:
-            frames = json.loads(path.read_text(encoding="utf-8")).get("frames", []) if path.is_file() else []
-            names = [frame.get("mask_path") for frame in frames if isinstance(frame, dict)]
-            return tuple(path.parent / name for name in names if isinstance(name, str))
-
-        return tuple(mask for mask in self._read("masks", path, named) if not mask.is_file())
+        masks = self._read("masks", path, lambda path: _named(path, "mask_path"))
+        return [mask for mask in masks if mask is not None and not mask.is_file()]
 
     def segmented(self) -> Bool[Tensor, "n"] | None:
         """Flags of the source's Gaussians in the last result of `segment`; None where there is none."""
@@ -135,3 +134,9 @@ class SceneCache:
 def _stamp(path: Path) -> tuple[int, int]:
     """Time and size of a file; zeros where there is none."""
     return (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)
+
+
+def _named(transforms: Path, key: str) -> list[Path | None]:
+    """The file that each frame of a transforms.json, as the step `capture` writes it, names under a key."""
+    content = json.loads(transforms.read_text(encoding="utf-8")) if transforms.is_file() else {"frames": []}
+    return [transforms.parent / frame[key] if key in frame else None for frame in content["frames"]]

@@ -66,6 +66,7 @@ class Client(Protocol):
 
     def upload_path(self, name: str) -> Path:
         """Where an uploaded file of that name goes; ValueError where the name is none."""
+        ...
 
     def uploaded(self, path: Path, use: str) -> None:
         """A file was uploaded for the control `use`."""
