@@ -153,6 +153,12 @@ class Client:
         self.send("step", to=name)
         self.wait(lambda: [name, "●"] in self.panel["steps"], what=f"the step {name}")
 
+    def settled(self, width: int, height: int) -> None:
+        """Wait for a picture of full size of another canvas, which comes behind all that was sent before."""
+        assert self.pixels.shape[1] != width
+        self.send("size", w=width, h=height)
+        self.wait(lambda: self.pixels.shape[1] == width and self.head["full"], what="the picture at rest")
+
     def finished(self) -> None:
         """Wait for a picture of full size of the present state."""
         count = len(self.heads)

@@ -202,10 +202,7 @@ def lit(project: Path) -> Iterator[tuple[Editor, Client]]:
 def same_picture(editor: Editor, window: Client, tolerance: float) -> None:
     """Assert that the picture at rest is the renderer's own, scaled."""
     view, pictures = editor.editing(), editor.pictures
-    # messages are taken in their order: a picture of another size comes behind all of them
-    wanted = 242 if window.pixels.shape[1] != 242 else 240
-    window.send("size", w=wanted, h=160)
-    window.wait(lambda: window.pixels.shape[1] == wanted and window.head["full"], what="the picture at rest")
+    window.settled(242 if window.pixels.shape[1] != 242 else 240, 160)
     assert view is not None
     assert pictures is not None
     orbit = editor.orbit(view)
@@ -255,23 +252,22 @@ def test_pictures_of_orbit_drag_and_release_are_the_renderer_s_and_end_as_the_st
     assert torch.equal(written.opacity_logits, shown.opacity_logits)
 
 
-def test_the_divider_shows_the_picture_before_on_its_left(window: Client) -> None:
-    window.send("size", w=200, h=120)
-    window.finished()
+def test_the_divider_shows_the_picture_before_on_its_left(editor: Editor, window: Client) -> None:
+    window.settled(200, 120)
     first = window.pixels
     # the opening view is the first photo's, to which Home leads back
     window.send("turn", x=0.2, y=0.1)
-    window.finished()
-    assert bool((window.pixels != first).any())
+    window.settled(204, 120)
     window.send("key", key="home")
-    window.finished()
+    view = editor.editing()
+    window.wait(lambda: view is not None and view.photo == 0, what="the first view")
+    window.settled(200, 120)
     assert np.array_equal(window.pixels, first)
     window.do("before", "Place alone")
     window.do("kind", "Pasted, unlit")
     window.wait(lambda: window.control("before")["value"] == "Place alone", what="the choice")
     window.wait(lambda: window.control("kind")["value"] == "Pasted, unlit", what="the other choice")
-    window.send("size", w=202, h=120)
-    window.wait(lambda: window.pixels.shape[1] == 202 and window.head["full"], what="its picture")
+    window.settled(202, 120)
     whole = window.pixels.astype(int)
     window.send("split", x=1.0)
     window.wait(lambda: window.head["split"] == 1.0 and window.head["full"], what="the place alone")
