@@ -1,7 +1,7 @@
 """The light of the edited scene, computed in a process of its own, so that no picture waits for it.
 
 The editor sends states. Back come the layers of the light transfer: a draft first, then, if it is wanted, those of the
-step `relight`. Started as `python -m splatgraft.editor.light_process PROJECT OUT`; not a command.
+step `relight`.
 """
 
 import contextlib
@@ -24,6 +24,8 @@ from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.relighting import Relit
 
 Stage = Literal["draft", "refined", "final"]
+_START = "import sys; from splatgraft.editor import light_process; light_process.main(sys.argv[1:])"
+"""What the process runs; a module that is run by its name would answer with classes that the editor does not know."""
 _FIELDS = ("objects", "erased", "light")
 """What the light depends on in an `EditState`."""
 _SETTLE_SECONDS = 0.2  # how long nothing must change before the light itself is begun, which cannot be interrupted
@@ -97,7 +99,7 @@ class LightProcess:
     def _start(self) -> None:
         self._sent, self._asked = {}, {}
         out = "" if self._project.out is None else str(self._project.out)
-        words = [sys.executable, "-m", "splatgraft.editor.light_process", str(self._project.file), out]
+        words = [sys.executable, "-c", _START, str(self._project.file), out]
         self._child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
         threading.Thread(target=self._listen, args=(self._child,), name="splatgraft light", daemon=True).start()
 
@@ -199,10 +201,3 @@ def _read(stream: IO[bytes]) -> Any:
     head = stream.read(8)
     content = stream.read(int.from_bytes(head, "little")) if len(head) == 8 else b""
     return pickle.loads(content) if content else None
-
-
-if __name__ == "__main__":
-    # of the imported module, so that the classes of answers are those that the editor knows
-    from splatgraft.editor import light_process
-
-    light_process.main(sys.argv[1:])
