@@ -140,7 +140,7 @@ class Form:
         return True
 
     def _add(self, kind: str, name: str, **properties: Any) -> None:
-        given = {key: value for key, value in properties.items() if value not in ("", False)}
+        given = {key: value for key, value in properties.items() if value is not False and value != ""}
         self.controls.append({"kind": kind, "id": name, **given, **({"more": True} if self._is_more else {})})
 
 
