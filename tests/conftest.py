@@ -30,7 +30,7 @@ _STORY_SECONDS = 600
 """Seconds after which a browser test counts as hanging; pytest-timeout then shows what each thread does."""
 
 
-_LONGEST = ("test_page_in_browser.py", "test_examples.py", "test_try.py", "test_exported_page.py")
+_LONGEST = ("test_editor_in_browser.py", "test_examples.py", "test_try.py", "test_exported_page.py")
 """Modules that run first, so that no worker is alone with one of them at the end."""
 
 

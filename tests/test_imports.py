@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 HEAVY = (
-    *("gsplat", "diffusers", "transformers", "accelerate", "peft", "bitsandbytes", "pycolmap", "viser"),
+    *("gsplat", "diffusers", "transformers", "accelerate", "peft", "bitsandbytes", "pycolmap", "uvicorn"),
     *("bpy", "ray", "onnxruntime", "huggingface_hub"),
 )
 

@@ -1,17 +1,21 @@
-"""A tiny project of two scenes, sessions and pages on copies of it, and one browser for all stories."""
+"""A tiny project of two scenes, sessions, editors and windows on copies of it, and one browser for a module."""
 
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from editor_pages import opened_page, scene_project
+from chromium import ARGUMENTS, browser_path
+from editor_pages import Client, opened_editor, scene_project
+from waiting import HANG_LIMIT
 
 from splatgraft.cli import main
-from splatgraft.editor.page.page import Page
+from splatgraft.editor.editor import Editor
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
+from splatgraft.project.toml_edit import with_keys
 
 
 @pytest.fixture(scope="session")
@@ -36,9 +40,17 @@ def session(project: Path) -> Session:
 
 
 @pytest.fixture
-def page(project: Path) -> Iterator[Page]:
-    """Return the page on that copy, with a real server."""
-    with opened_page(project) as found:
+def editor(project: Path) -> Iterator[Editor]:
+    """Return the editor on that copy without the light transfer, whose process takes seconds to start."""
+    project.write_text(with_keys(project.read_text(), "relight", {"light": "off"}))
+    with opened_editor(project) as found:
+        yield found
+
+
+@pytest.fixture
+def window(editor: Editor) -> Iterator[Client]:
+    """Return a window on that editor."""
+    with Client(editor.server.port).window() as found:
         yield found
 
 
@@ -49,22 +61,19 @@ def browser() -> Iterator[Any]:
     It is closed behind each module: Playwright cannot be started twice in one process, and test_exported_page.py has a
     browser of its own.
     """
-    from editor_driver import with_browser
+    path = browser_path()
+    from playwright.sync_api import sync_playwright
 
-    with with_browser() as found:
-        yield found
-
-
-@pytest.fixture
-def window(browser: Any, page: Page) -> Iterator[Any]:
-    """Return a window on the page."""
-    from editor_driver import Window
-
-    opened = Window.opened(browser, address_of(page))
-    yield opened
-    opened.page.close()
-
-
-def address_of(page: Page) -> str:
-    """Return the complete address of a page that a test serves."""
-    return f"http://127.0.0.1:{page.context.guarded.port}/?token=secret"
+    with sync_playwright() as driver, tempfile.TemporaryDirectory() as folder:
+        context = driver.chromium.launch_persistent_context(
+            folder,
+            executable_path=path,
+            headless=True,
+            args=[*ARGUMENTS, "--disable-gpu"],
+            viewport={"width": 1000, "height": 640},
+            timeout=1000 * HANG_LIMIT,
+            has_touch=True,
+        )
+        context.set_default_timeout(1000 * HANG_LIMIT)
+        yield context
+        context.close()

@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from editor_pages import TOKEN, served
-from viser import _messages
+from editor_pages import TOKEN, Client, served
+from websockets.exceptions import InvalidStatus
 
 from splatgraft.cli import main
 from splatgraft.editor.access import allowed_query, cookie_name, why_refused
@@ -65,10 +65,29 @@ def test_a_page_s_query_may_hold_the_token_alone() -> None:
     assert allowed_query("/?playbackPath=https://evil.example/a.viser") == "?"
 
 
+class Files:
+    """A client of the server that gives one file."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def file(self, name: str) -> Path | None:
+        path = (self.folder / name).resolve()
+        return path if path.name == "a.sog" and path.parent == self.folder.resolve() else None
+
+    def opened(self, window: object) -> None: ...
+    def closed(self, window: object) -> None: ...
+    def received(self, window: object, message: dict[str, object]) -> None: ...
+    def uploaded(self, path: Path, use: str) -> None: ...
+
+    def upload_path(self, name: str) -> Path:
+        return self.folder / name
+
+
 def test_the_server_refuses_what_is_foreign_and_serves_only_shared_files(tmp_path: Path) -> None:
     (tmp_path / "a.sog").write_bytes(b"scene")
     with served() as guarded:
-        guarded.files = lambda name: path if (path := (tmp_path / name).resolve()).name == "a.sog" else None
+        guarded.attach(Files(tmp_path))
 
         def answer(path: str, **headers: str) -> http.client.HTTPResponse:
             connection = http.client.HTTPConnection("127.0.0.1", guarded.port, timeout=600)
@@ -76,8 +95,7 @@ def test_the_server_refuses_what_is_foreign_and_serves_only_shared_files(tmp_pat
             found = connection.getresponse()
             found.read()
             connection.close()
-            # the server ends the connection after each answer, and a client must not send another request into it
-            assert found.headers["Connection"] == "close", path
+            assert found.headers["X-Frame-Options"] == "DENY" or found.status == 403
             return found
 
         page = answer(f"/?token={TOKEN}")
@@ -93,41 +111,23 @@ def test_the_server_refuses_what_is_foreign_and_serves_only_shared_files(tmp_pat
         assert answer(f"/?token={TOKEN}", Origin="http://evil.example").status == 403
         assert answer(f"/?token={TOKEN}", Host="evil.example").status == 403
         assert answer(f"/?token={TOKEN}&websocket=ws://evil.example").headers["Location"] == f"?token={TOKEN}"
+        assert "default-src 'self'" in page.headers["Content-Security-Policy"]
         outside = ("/files/../project.toml", "/files/%2e%2e/project.toml", "/project.toml", "/files/", "/files/b/a.sog")
         for path in (*outside, "/files/%00", f"/files/{'a' * 5000}", f"/{'a' * 5000}", "/%00"):
             assert answer(path, Cookie=cookie).status == 404, path
 
 
-def test_the_oldest_window_edits_and_tunnels_are_blocked() -> None:
-    with served() as guarded:
-        passed: list[object] = []
-
-        async def inner(window: int, message: object) -> None:
-            passed.append(window)
-
-        def send(window: int, message: object) -> None:
-            with pytest.raises(StopIteration):
-                guarded._forward_allowed(inner, window, message).send(None)
-
-        message = _messages.GuiFormSubmitMessage("x")
-        for number in (1, 2):
-            guarded._opened(number)
-        send(1, _messages.ShareUrlRequest())
-        send(2, message)
-        assert passed == []
-        send(1, message)
-        assert passed == [1]
-        guarded._closed(1)
-        send(2, message)
-        assert passed == [1, 2]
-        guarded._closed(2)
+def test_a_websocket_needs_the_page_s_origin_and_the_token() -> None:
+    with served() as server:
+        client = Client(server.port)
+        client.connect().close()
+        for wrong in ({"cookie": ""}, {"cookie": "splatgraft_token_1=secret"}, {"origin": "http://evil.example"}):
+            with pytest.raises(InvalidStatus):
+                client.connect(**wrong)
 
 
 def test_the_page_is_served_before_torch_is_loaded() -> None:
-    code = (
-        "import sys, splatgraft.commands.edit, splatgraft.editor.page.opening, splatgraft.editor.page.server;"
-        "print('torch' in sys.modules)"
-    )
+    code = "import sys, splatgraft.commands.edit, splatgraft.editor.server; print('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
 
 

@@ -3,12 +3,11 @@
 import shutil
 import zipfile
 from pathlib import Path
-from typing import Any, cast
 
 import cv2
 import numpy as np
 import pytest
-from editor_pages import opened_page, sends
+from editor_pages import Client, opened_editor
 from tiny_project import ball, photograph, plane
 
 from splatgraft.editor.project import RenderedViews
@@ -91,28 +90,55 @@ def test_a_project_is_named_with_the_command_that_opens_it(project: Path) -> Non
         assert not found.is_usable
 
 
-def test_a_project_is_started_only_of_two_usable_paths(inputs: Path, tmp_path: Path) -> None:
-    with opened_page(tmp_path / "new" / "project.toml") as page:
-        phase = cast("Any", page.phases["Open"])
-        assert phase._start.disabled
-        for second, usable in (("letter.pdf", False), ("ball.ply", True)):
-            phase._look((str(inputs / "ball.ply"), str(inputs / second)))
-            assert phase._start.disabled != usable
-        assert "80 Gaussians" in phase._found_source.content
+def test_a_project_is_started_only_of_two_usable_paths_which_a_list_of_folders_gives(
+    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Path, "home", lambda: inputs)
+    with opened_editor(tmp_path / "new" / "project.toml") as editor, Client(editor.server.port).window() as window:
+        assert window.control("start")["disabled"]
+        window.do("source", str(inputs / "ball.ply"))
+        window.says("80 Gaussians")
+        window.do("target", str(inputs / "letter.pdf"))
+        window.says("expected a video that OpenCV can read")
+        assert window.control("start")["disabled"]
+        # the field gives the folder at which the list begins
+        window.send("do", id="browse_target")
+        window.wait(lambda: window.has("entries"), what="the list of folders")
+        assert {"photos/", "ball.ply", "walk.avi"} <= set(window.control("entries")["options"])
+        assert "letter.pdf" not in window.control("entries")["options"]
+        window.do("entries", "../../etc/passwd")
+        window.do("entries", "photos/")
+        window.says("8 photos are in this folder")
+        window.do("use_folder")
+        window.says("8 photos, no masks")
+        window.wait(lambda: not window.control("start").get("disabled"), what="the start")
+        # photos that are dropped are a folder of their own
+        number, photo = window.panel["window"], (inputs / "photos" / "0.png").read_bytes()
+        for index in range(8):
+            address = f"/upload?window={number}&name=photos_7/{index}.png&use=upload_target"
+            assert window.request("POST", address, photo + bytes([index]))[0] == 200
+        uploaded = str(tmp_path / "new" / "uploads" / "photos_7")
+        window.wait(lambda: window.control("target")["value"] == uploaded, what="the folder of the photos")
 
 
 def test_an_opened_project_shows_how_its_scenes_are_viewed(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = with_keys(project.read_text(), "source", {"up": [0.0, -1.0, 0.0], "look": "within"})
+    text = with_keys(text, "relight", {"light": "off"})
     project.write_text(with_keys(text, "target", {"up": [0.0, 0.25, 1.0]}))
-    with opened_page(project) as page:
-        page.show_phase("Open")
-        phase, session = cast("Any", page.phases["Open"]), page.context.require_session()
-        assert (phase._looks["source"].value, phase._ups["source"].value) == ("from within", "-y")
-        assert (phase._looks["target"].value, phase._ups["target"].value) == ("from around", "(0, 0.25, 1)")
+    with opened_editor(project) as editor, Client(editor.server.port).window() as window:
+        session = editor.require_session()
+        monkeypatch.setattr(editor, "run", lambda to, title: None)
+        window.step("Open")
+        assert (window.control("look_source")["value"], window.control("up_source")["value"]) == ("from within", "-y")
+        assert (window.control("look_target")["value"], window.control("up_target")["value"]) == (
+            "from around",
+            "(0, 0.25, 1)",
+        )
         # one of them is changed: the other one stays
-        monkeypatch.setattr(page.context, "run", lambda to, title: None)
-        sends(phase._looks["target"], "from within")
+        window.do("look_target", "from within")
+        window.wait(lambda: window.control("look_target")["value"] == "from within", what="the other look")
         assert session.files.rendered_views[1] == RenderedViews((0.0, 0.25, 1.0), is_within=True)
-        sends(phase._ups["target"], "as found")
+        window.do("up_target", "as found")
+        window.wait(lambda: window.control("up_target")["value"] == "as found", what="the other up")
         assert session.files.rendered_views[1] == RenderedViews(None, is_within=True)
         assert session.files.rendered_views[0] == RenderedViews((0.0, -1.0, 0.0), is_within=True)

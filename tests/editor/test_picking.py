@@ -95,13 +95,16 @@ def test_level_of_detail_keeps_the_largest_coverage_in_order() -> None:
 @pytest.mark.parametrize("canvas", [(800, 300), (300, 800), (640, 480)])
 def test_a_click_on_a_drawn_point_is_that_point(canvas: tuple[int, int]) -> None:
     view = PhotoView((320, 200), canvas)
-    prompt = ViewPrompt(inside=torch.tensor([[250.0, 40.0]]))
-    drawn = view.drawn(np.full((100, 160, 3), 128, np.uint8), prompt).astype(int)
+    photo = np.full((100, 160, 3), 128, np.uint8)
+    photo[18:23, 123:128] = (0, 255, 0)  # around 250, 40 of the photo, of half its size
+    drawn = view.drawn(photo).astype(int)
     assert drawn.shape == (canvas[1], canvas[0], 3)
     rows, columns = ((drawn[..., 1] > 180) & (drawn[..., 0] < 120)).nonzero()
-    found = view.pixel_at(((columns.mean() + 0.5) / canvas[0], (rows.mean() + 0.5) / canvas[1]))
-    # to a pixel of the canvas
-    assert found == pytest.approx((250, 40), abs=1.5 / view.scale)
+    place = (columns.mean() + 0.5) / canvas[0], (rows.mean() + 0.5) / canvas[1]
+    # to two pixels of the canvas and one of the small photo
+    assert view.pixel_at(place) == pytest.approx((251, 41), abs=2 / view.scale + 2)
+    assert view.place_of(250 / 320, 40 / 200) == pytest.approx(place, abs=0.02)
+    assert view.pixel_at(view.place_of(0.3, 0.6)) == pytest.approx((96, 120))
     # the canvas is larger than the photo on one pair of sides, unless it has its shape
     assert view.pixel_at((0.5, 0.5)) == pytest.approx((160, 100))
     if canvas == (800, 300):

@@ -17,9 +17,10 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor import relit_preview
-from splatgraft.editor.pictures import PICTURE_KINDS
+from splatgraft.editor.light_process import Lit
+from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.project import Project
-from splatgraft.editor.relit_preview import CoarseGaussians, coarsen, upsample_light
+from splatgraft.editor.relit_preview import CoarseGaussians, RelitPreview, coarsen, upsample_light
 from splatgraft.editor.session import Session
 from splatgraft.formats import read_gaussians
 from splatgraft.project.toml_edit import with_keys
@@ -44,70 +45,110 @@ def session(lit: Path, tmp_path: Path) -> Session:
 
 
 def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Session) -> None:
-    state = session.placed_state()
+    state, pictures = session.placed_state(), Pictures(session.scenes)
     camera = session.scenes.cameras(session.files.target_cameras)[0]
-    for kind in PICTURE_KINDS:
-        if kind == "Result":
-            with pytest.raises(ValueError, match="finished run"):
-                session.pictures.view(kind, state, camera)
+    refused = {"result": "no result yet", "shadow": "being computed"}
+    for kind in ("lit", "pasted", "result", "place", "shadow", "photo"):
+        if kind in refused:
+            with pytest.raises(ValueError, match=refused[kind]):
+                pictures.draw(kind, state, camera, 0)
             continue
-        picture = session.pictures.view(kind, state, camera).pixels
+        picture = pictures.draw(kind, state, camera, 0)
         assert picture.shape == (camera.height, camera.width, 3)
         assert picture.std() > 1, kind
-    assert session.relighting.is_relit(state)
-    assert not session.relighting.is_relit(moved(state))
+    relit = RelitPreview(session.scenes).relit(state)
+    pictures.lit.add(state, Lit("final", relit, 0.0))
+    assert pictures.draw("shadow", state, camera).std() > 1
+    assert pictures.lit.stage(state) == "final"
+    # a draft that comes late does not replace it
+    pictures.lit.add(state, Lit("draft", relit, 0.0))
+    assert pictures.lit.stage(state) == "final"
+    assert pictures.lit.stage(moved(state)) == ""
+
+
+def test_a_moved_object_keeps_its_colours_over_a_contact_shadow_until_its_light_is_there(session: Session) -> None:
+    lit, state = Pictures(session.scenes).lit, session.placed_state()
+    relit = RelitPreview(session.scenes).relit(state)
+    lit.add(state, Lit("final", relit, 0.0))
+    before, is_object = relit.bake(state.weights)
+    assert lit.scene(state) is lit.scene(state)
+    assert torch.equal(lit.scene(state).sh, before.sh)
+    placed = session.objects()[0].target_from_object
+    shift = torch.tensor([0.3, 0.0, 0.0])
+    there = replace(placed, translation=placed.translation + shift)
+    after = lit.scene(state.with_object(0, replace(session.objects()[0], target_from_object=there)))
+    count = int(is_object.sum())
+    # float32 of two transforms
+    assert torch.allclose(after.means[-count:], before.means[is_object] + shift, atol=1e-5)
+    assert torch.allclose(after.sh[-count:, 0], before.sh[is_object][:, 0], atol=1e-5)
+    place = lit.place(state)
+    darker = (place.sh[:, 0] - after.sh[: place.count, 0]).mean(1)
+    foot = there.points(session.placeable_object(0).base.point)
+    apart = (place.means - foot)[:, :2].norm(dim=1)
+    assert float(darker[apart < 0.15].max()) > 0.1
+    assert bool((darker >= -1e-6).all())
+    assert float(darker[apart > 1.0].abs().max()) < 0.02
+    # the place itself is as it was
+    assert torch.equal(lit.place(state).sh, session.scenes.gaussians(session.files.target_scene).sh)
+
+
+def test_a_finished_light_is_read_from_its_file(session: Session) -> None:
+    assert main(["run", str(session.files.file), "--to", "relight"]) == 0
+    lit, state = Pictures(session.scenes).lit, session.placed_state()
+    lit.adopt(state)
+    assert lit.stage(state) == "file"
+    assert torch.equal(lit.scene(state).sh, read_gaussians(session.files.relit).sh)
+    # its layers are not known: other weights need them
+    assert lit.stage(replace(state, weights=LayerWeights(shadow=0.5))) == "draft"
 
 
 @pytest.mark.parametrize("light", [None, LIGHT])
 def test_the_previewed_light_equals_the_step_s_result(session: Session, light: Light | None) -> None:
     session.change(replace(moved(session.placed_state()), weights=LayerWeights(shadow=0.5), light=light))
+    relighting = RelitPreview(session.scenes)
     # a draft must not change the full result
-    draft = session.relighting.scene(session.state, draft=True)
-    assert not session.relighting.is_relit(session.state)
-    relit = session.relighting.scene(session.state)
-    assert session.relighting.scene(session.state, draft=True) is relit
-    assert draft.count <= relit.count
+    draft = relighting.layers(session.state, draft=True)
+    assert not relighting.is_relit(session.state)
+    relit = relighting.layers(session.state, draft=False)
+    assert relighting.layers(session.state, draft=True) is relit
+    assert draft.gaussians.count <= relit.gaussians.count
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
-    written = read_gaussians(session.files.relit)
-    assert torch.equal(written.sh, relit.sh)
-    assert torch.equal(written.means, relit.means)
+    written, shown = read_gaussians(session.files.relit), relit.bake(session.state.weights)[0]
+    assert torch.equal(written.sh, shown.sh)
+    assert torch.equal(written.means, shown.means)
 
 
 def test_the_light_after_a_move_equals_the_step_s_result(session: Session) -> None:
-    relighting, first = session.relighting, session.placed_state()
-    relighting.scene(first)
+    relighting, first = RelitPreview(session.scenes), session.placed_state()
+    relighting.relit(first)
     assert not relighting.refine(first)
     session.change(moved(first))
-    draft = relighting.scene(session.state, draft=True)
+    draft = relighting.draft(session.state)
     # drafts keep the sources of the light, which were estimated at another place
     assert relighting.refine(session.state)
-    assert relighting.scene(session.state, draft=True) is not draft
-    relit = relighting.scene(session.state)
+    assert relighting.layers(session.state, draft=True) is not draft
+    relit = relighting.relit(session.state)
     assert not relighting.refine(session.state)
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
-    assert torch.equal(read_gaussians(session.files.relit).sh, relit.sh)
+    assert torch.equal(read_gaussians(session.files.relit).sh, relit.bake(session.state.weights)[0].sh)
 
 
 def test_the_shown_object_without_light_equals_what_the_step_writes(session: Session) -> None:
     file = session.files.file
-    text = with_keys(file.read_text(), "relight", {"light": "off"})
-    file.write_text(text)
+    file.write_text(with_keys(file.read_text(), "relight", {"light": "off"}))
     assert session.reload()
     assert main(["run", str(file), "--to", "relight"]) == 0
-    state = session.placed_state()
-    assert session.relighting.is_relit(state)
-    shown, written = session.relighting.scene(state), read_gaussians(session.files.relit)
+    state, pictures = session.placed_state(), Pictures(session.scenes)
+    shown, written = pictures.lit.scene(state), read_gaussians(session.files.relit)
     assert torch.equal(shown.sh, written.sh)
     assert torch.equal(shown.means, written.means)
-    assert "off" in session.relighting.light_mode_note()
-    camera = session.scenes.cameras(session.files.target_cameras)[0]
-    with pytest.raises(ValueError, match="physical transfer"):
-        session.pictures.view("Shadow layer", state, camera)
+    with pytest.raises(ValueError, match="off"):
+        pictures.draw("shadow", state, session.scenes.cameras(session.files.target_cameras)[0])
 
 
 def test_the_preview_of_a_photograph_is_unchanged(session: Session, tmp_path: Path) -> None:
     camera = session.scenes.cameras(session.files.target_cameras)[0]
-    photo = session.pictures.view("Photograph", session.placed_state(), camera).pixels
+    photo = Pictures(session.scenes).draw("photo", session.placed_state(), camera, 0)
     stored = read_rgb(session.files.root.parent / "photos" / "target" / "images" / camera.names[0])
     assert torch.equal(torch.from_numpy(photo), (stored * 255).round().to(torch.uint8))
 
@@ -157,18 +198,18 @@ def test_what_drafts_share_is_computed_before_the_first_move(project: Path, monk
     drafts = []
     for is_prepared in (False, True):
         session = Session(Project(project))
-        state = session.placed_state()
-        session.relighting.draft(state)
+        state, relighting = session.placed_state(), RelitPreview(session.scenes)
+        relighting.draft(state)
         # the target and the object; the source follows
         assert len(reduced) == 2
-        session.relighting.relit(state)
+        relighting.relit(state)
         if is_prepared:
-            session.relighting.prepare_drafts(state)
+            relighting.prepare_drafts(state)
             assert len(reduced) == 3
         session.set_placement(
             0, replace(session.objects()[0].target_from_object, translation=torch.tensor([0.1, 0, 0]))
         )
-        drafts.append(session.relighting.draft(session.placed_state()))
+        drafts.append(relighting.draft(session.placed_state()))
         assert len(reduced) == 3
         # the same tensor in all drafts, so that memos of the light stay valid
         assert len({id(call.kwargs["erased"]) for call in drawn.call_args_list}) == 1

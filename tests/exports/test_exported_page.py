@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from editor_driver import ARGUMENTS, browser_path
+from chromium import GL_ARGUMENTS, browser_path
 from format_files import TOOLS
 from PIL import Image
 from small_transfer import darkened, write_transfer
@@ -52,7 +52,7 @@ def browser() -> Iterator[Any]:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:
-        found = driver.chromium.launch(executable_path=path, args=list(ARGUMENTS), timeout=1000 * HANG_LIMIT)
+        found = driver.chromium.launch(executable_path=path, args=list(GL_ARGUMENTS), timeout=1000 * HANG_LIMIT)
         yield found
         found.close()
 
@@ -179,7 +179,7 @@ def test_the_divider_and_the_full_screen(browser, project, page_file):
     after = page.picture()
     assert divider.get_attribute("aria-valuenow") == "0"
     handle = divider.locator("svg").bounding_box()  # half of it is on the page
-    page.page.mouse.move(handle["x"] + 30, handle["y"] + 22)
+    page.page.mouse.move(handle["x"] + 30, handle["y"] - 60)  # the whole line is dragged, not its handle alone
     page.page.mouse.down()
     page.page.mouse.move(264, 100, steps=4)
     page.page.mouse.up()

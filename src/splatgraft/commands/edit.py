@@ -29,8 +29,6 @@ class Edit:
     """Port to listen at, on this machine only; the next free one if it is taken."""
     keep_closed: bool = False
     """Print the address without opening it in the browser."""
-    budget: int = 300_000
-    """Maximum number of Gaussians drawn while the view moves; still pictures and files have all."""
 
     def execute(self, console: Console) -> int:
         """Serve until Ctrl-C."""
@@ -43,8 +41,7 @@ class Edit:
 
     def serve(self, console: Console, stop: threading.Event) -> None:
         """Serve until `stop` is set; raises ValueError if another editor has the project open."""
-        from splatgraft.editor.page.opening import Opening
-        from splatgraft.editor.page.server import GuardedServer
+        from splatgraft.editor.server import Server
 
         path = self.project.absolute()
         file = path if path.suffix == ".toml" else path / PROJECT_FILE
@@ -53,19 +50,16 @@ class Edit:
             raise ValueError(f"{out}: expected a folder for the results, found a read-only one")
         with locked(file.parent / "edit"):
             token = secrets.token_urlsafe(16)
-            guarded = GuardedServer(token, host=LOOPBACK[0], port=self.port)
-            loading = guarded.viser.gui.add_markdown("Loading the project ...")
-            self._say_address(f"http://{LOOPBACK[0]}:{guarded.port}/?token={token}", console)
-            # torch, numba and the scenes take seconds to load, and the browser shows a sample of the scene meanwhile
-            opening = Opening(guarded.viser, file, file.parent if out is None else out)
-            from splatgraft.editor.page.page import Page
+            server = Server(token, host=LOOPBACK[0], port=self.port)
+            self._say_address(f"http://{LOOPBACK[0]}:{server.port}/?token={token}", console)
+            # torch, numba and the scenes take seconds to load; the browser opens the page meanwhile
+            from splatgraft.editor.editor import Editor
             from splatgraft.editor.project import Project
 
-            page = Page(guarded, Project(file, out), budget=self.budget, opening=opening)
-            loading.remove()
+            editor = Editor(server, Project(file, out))
             stop.wait()
-            page.close()
-            guarded.close()
+            editor.close()
+            server.close()
 
     def _say_address(self, address: str, console: Console) -> None:
         console.result(address)

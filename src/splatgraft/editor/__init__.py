@@ -1,4 +1,4 @@
 """The web editor: select and place objects and adjust their light in the browser.
 
-Only `page/` imports viser. Everything else is a project's state and its files, previews, and jobs in child processes.
+A project's state and its files, a server, pictures of our renderer, and jobs and light in child processes.
 """

@@ -45,8 +45,7 @@ def cookie_name(host: str) -> str:
 def allowed_query(path: str) -> str | None:
     """The query with which a page is to be opened instead of this path, with its question mark; None where it can stay.
 
-    Only the token is allowed: viser's page takes the address of another server from its query, whose controls may
-    hold scripts.
+    Only the token is allowed, so that no link can set anything else.
     """
     given = parse_qsl(urlsplit(path).query, keep_blank_values=True)
     allowed = [(key, value) for key, value in given if key == "token"]

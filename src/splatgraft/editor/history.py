@@ -23,7 +23,7 @@ from splatgraft.project.layout import EDITOR_FOLDER
 from splatgraft.project.placement import ObjectPlacement
 from splatgraft.project.prompts import prompts_from_json, prompts_to_json
 from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
-from splatgraft.runtime.files import atomic_write, relative_name
+from splatgraft.runtime.files import atomic_write, relative_name, writable
 
 _HISTORY_FILE, _STATES_FOLDER = "history.json", "states"
 _IN_MEMORY = 20
@@ -67,10 +67,17 @@ class StateStore:
         self._states = self._folder / _STATES_FOLDER
         self._recent: OrderedDict[str, EditState] = OrderedDict()
 
+    def name(self, state: EditState) -> str:
+        """The name of a state, which need not be stored."""
+        name = _name(self._content(state))
+        self._remember(name, state)
+        return name
+
     def save(self, state: EditState) -> str:
         """Write the state unless it is stored already; returns its name."""
-        self._states.mkdir(parents=True, exist_ok=True)
-        content = json.dumps(_to_json(state, self._project_folder), sort_keys=True).encode()
+        with writable(self._states):
+            self._states.mkdir(parents=True, exist_ok=True)
+        content = self._content(state)
         name = _name(content)
         if not self._file(name).is_file():
             with atomic_write(self._file(name)) as stream:
@@ -106,6 +113,9 @@ class StateStore:
         """Write the list of names."""
         with atomic_write(self._folder / _HISTORY_FILE) as stream:
             stream.write(json.dumps(asdict(history)).encode())
+
+    def _content(self, state: EditState) -> bytes:
+        return json.dumps(_to_json(state, self._project_folder), sort_keys=True).encode()
 
     def _file(self, name: str) -> Path:
         return self._states / f"{name}.json"

@@ -13,13 +13,8 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.prompts import ViewPrompt
 
-_SAME_VIEW = 2e-3
-"""Distance over that of the scene, plus that of the unit directions, below which a view is that of a camera."""
 _NEAR = 0.012
 """A click this near to a point removes it; distance over the photo's longer side."""
-_RADIUS = 0.007
-"""Radius of a drawn point over the canvas's longer side."""
-_INSIDE, _OUTSIDE, _EDGE = (60, 220, 90), (235, 40, 60), (255, 255, 255)
 _BACKGROUND = 24
 """Grey beside the photo, 0 to 255."""
 
@@ -57,24 +52,18 @@ class PhotoView:
         width, height = (max(1, round(self.scale * side)) for side in self.photo)
         return min(width, self.canvas[0] - left), min(height, self.canvas[1] - top)
 
-    def drawn(self, pixels: UInt8[np.ndarray, "h w 3"], prompt: ViewPrompt) -> UInt8[np.ndarray, "y x 3"]:
-        """The canvas: the photo of any size, with the points and the rectangle of a prompt."""
+    def drawn(self, pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "y x 3"]:
+        """The canvas with the photo, which is given in any size."""
         left, top = (round(x) for x in self.corner)
         width, height = self.drawn_size
         out = np.full((self.canvas[1], self.canvas[0], 3), _BACKGROUND, np.uint8)
         out[top : top + height, left : left + width] = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
-        radius = max(3, round(_RADIUS * max(self.canvas)))
-
-        def at(x: float, y: float) -> tuple[int, int]:
-            return round(self.corner[0] + self.scale * x), round(self.corner[1] + self.scale * y)
-
-        if prompt.box is not None:
-            cv2.rectangle(out, at(*prompt.box[:2]), at(*prompt.box[2:]), _INSIDE, max(1, radius // 3))
-        for points, color in ((prompt.inside, _INSIDE), (prompt.outside, _OUTSIDE)):
-            for x, y in points.tolist():
-                cv2.circle(out, at(x, y), radius + 2, _EDGE, -1, cv2.LINE_AA)
-                cv2.circle(out, at(x, y), radius, color, -1, cv2.LINE_AA)
         return out
+
+    def place_of(self, x: float, y: float) -> tuple[float, float]:
+        """The place of a photo's point, given over its sides, over the canvas's width and height."""
+        (left, top), (width, height) = self.corner, self.photo
+        return (left + self.scale * x * width) / self.canvas[0], (top + self.scale * y * height) / self.canvas[1]
 
 
 def prompt_of(prompts: Mapping[str, ViewPrompt] | None, name: str) -> ViewPrompt:
@@ -106,17 +95,6 @@ def with_click(
     if not len(prompt.inside) and not len(prompt.outside) and prompt.box is None:
         del found[key]
     return found or None
-
-
-def standing_at(view: Cameras, cameras: Cameras, *, scale: float) -> int | None:
-    """The number of the camera at which a view stands and looks the same way; None where there is none.
-
-    `scale` is a typical distance of the scene, world units.
-    """
-    pose, poses = view.world_from_camera[0], cameras.world_from_camera
-    far = (poses[:, :3, 3] - pose[:3, 3]).norm(dim=1) / scale + (poses[:, :3, 2] - pose[:3, 2]).norm(dim=1)
-    index = int(far.argmin())
-    return index if float(far[index]) < _SAME_VIEW else None
 
 
 def seen_best(

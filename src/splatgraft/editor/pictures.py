@@ -1,206 +1,358 @@
-"""Pictures of the edited scene by splatgraft's renderer: pasted object, relit scene, result, and their layers."""
+"""Pictures of the edited scene by splatgraft's renderer, lit by the newest layers that there are.
 
+An object that was moved since keeps the colours of its last lit place, over a contact shadow of its footprint.
+"""
+
+import math
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import read_upright
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.images import read_upright, resize
+from splatgraft.core.prompts import ViewPrompt
+from splatgraft.core.similarity import Similarity
+from splatgraft.editor.light_process import Lit
 from splatgraft.editor.memo import Memo
 from splatgraft.editor.photo_view import PhotoView, prompt_of
-from splatgraft.editor.relit_preview import RelitPreview, largest_coverage_indices
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState
-from splatgraft.rendering import render
+from splatgraft.project.gaussian_flags import read_flags
+from splatgraft.project.layout import IS_OBJECT_FILE
+from splatgraft.project.placement import ObjectPlacement
+from splatgraft.relighting import LayerWeights, Relit
+from splatgraft.relighting.shading import apply_gain
+from splatgraft.rendering import RenderOptions, render, view_operator
+from splatgraft.segmentation import CUT_SIDE_PX, grabcut_mask, seed_selection
 
-PictureKind = Literal[
-    "Copy-paste",
-    "Light transfer",
-    "Result",
-    "Target alone",
-    "Shadow layer",
-    "Photograph",
-    "Source",
-    "Selection",
-    "Object alone",
-]
-PICTURE_KINDS: tuple[PictureKind, ...] = get_args(PictureKind)[:6]
-"""Kinds of pictures of the target."""
-SOURCE_KINDS: tuple[PictureKind, ...] = get_args(PictureKind)[6:]
-"""Kinds of pictures of the source."""
+Kind = Literal["lit", "pasted", "result", "place", "shadow", "photo"]
 TINT = (1.0, 0.45, 0.1)
 """sRGB color of what is selected."""
-_LONGEST_PX = 1920
-"""Longest side of a photo on the canvas, pixels; on a larger canvas the browser enlarges it."""
-NEEDS_LIGHT: tuple[PictureKind, ...] = ("Light transfer", "Shadow layer")
-"""Kinds that need the light transfer."""
+_LONGEST_PX = 1920  # of a photo on the canvas; on a larger canvas the browser enlarges it
+_DARKEST, _SHADOW_WIDTH = (
+    0.5,
+    0.35,
+)  # of a contact shadow: share of the light that it takes; its width over the object's radius
+_NO_TURN = 1e-5  # largest entry of a rotation over the identity's that rounding makes
+_FOOT_SHARE, _FOOT_POINTS = 0.2, 200  # part of an object's height that counts as its foot; its points
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
-    """A rendered image with the depth of what it shows."""
+class _LitState:
+    """What is known of the lit scene of one state."""
 
-    pixels: UInt8[np.ndarray, "h w 3"]
-    """sRGB."""
-    depth: Float[np.ndarray, "h w"] | None = None
-    """Depth along the optical axis, world units; infinite where nothing is. None for images without depth."""
+    state: EditState
+    stage: str
+    """"final", "refined" or "draft"; "file": read from the step's result, without layers."""
+    relit: Relit | None
+    baked: tuple[Gaussians, Bool[Tensor, "b"]] | None = None
+
+    def fits(self, state: EditState) -> bool:
+        """Whether a state has the same light at the same places."""
+        return self.state.light is state.light and self.stands_as(state)
+
+    def stands_as(self, state: EditState) -> bool:
+        return self.state.erased is state.erased and same_places(self.state.objects, state.objects)
+
+
+def same_places(a: Sequence[ObjectPlacement] | None, b: Sequence[ObjectPlacement] | None) -> bool:
+    """Whether the same objects stand at the same places."""
+    if a is b:
+        return True
+    return len(a or ()) == len(b or ()) and all(
+        x.object_path == y.object_path
+        and x.target_from_object.scale == y.target_from_object.scale
+        and torch.equal(x.target_from_object.rotation, y.target_from_object.rotation)
+        and torch.equal(x.target_from_object.translation, y.target_from_object.translation)
+        for x, y in zip(a or (), b or (), strict=True)
+    )
+
+
+class LitScenes:
+    """The newest lit scenes, from the light process and from the step's files."""
+
+    def __init__(self, scenes: SceneCache) -> None:
+        """Know of none yet."""
+        self._scenes, self._memo, self._lock = scenes, Memo(), threading.RLock()
+        self._now: _LitState | None = None
+
+    def add(self, state: EditState, lit: Lit) -> None:
+        """Take layers that the light process has made."""
+        with self._lock:
+            order = ("draft", "refined", "final")
+            now = self._now
+            is_worse = now is not None and now.relit is not None and now.fits(state) and now.stage in order
+            if is_worse and now is not None and order.index(lit.stage) < order.index(now.stage):
+                return
+            if now is not None and now.stage == "file" and now.fits(state) and lit.stage != "final":
+                return  # the finished result stays
+            self._now = _LitState(state, lit.stage, lit.relit)
+
+    def adopt(self, state: EditState) -> None:
+        """Take the result of the step `relight`, which is up to date for a state."""
+        path = self._scenes.files.relit
+        flags = read_flags(path.with_name(IS_OBJECT_FILE))
+        scene = self._scenes.gaussians(path)
+        with self._lock:
+            self._now = _LitState(state, "file", None, (scene, flags))
+
+    def stage(self, state: EditState) -> str:
+        """The stage of what is known of a state; empty where nothing is."""
+        now = self._now
+        if now is None or not now.fits(state):
+            return ""
+        return "draft" if now.stage == "file" and not _same_weights(now.state, state) else now.stage
+
+    def relit(self, state: EditState) -> Relit | None:
+        """The layers of a state; None where they are not known yet."""
+        now = self._now
+        return now.relit if now is not None and now.fits(state) else None
+
+    def scene(self, state: EditState, *, is_dragged: bool = False) -> Gaussians:
+        """The scene of a state with the newest colours; in a drag the support is not flattened under the objects."""
+        now = self._now
+        if not self._scenes.files.transfers_light or not state.objects:
+            return self.pasted(state)
+        if now is not None and now.stands_as(state):
+            return self._baked(now, state.weights)[0]
+        return self._moved(now, state, self.place(state) if is_dragged else self._flattened(state))
+
+    def pasted(self, state: EditState) -> Gaussians:
+        """The scene that the step `compose` writes."""
+        composite = self._scenes.composite(state)
+        return self._memo.get("pasted", (composite,), composite.bake)[0]
+
+    def place(self, state: EditState) -> Gaussians:
+        """The target without what is erased."""
+        target, erased = self._scenes.gaussians(self._scenes.files.target_scene), state.erased
+        if erased is None:
+            return target
+        if len(erased) != target.count:
+            raise ValueError(
+                f"erased.npy: expected one flag per Gaussian of the target, {target.count:,}; found {len(erased):,}; "
+                "restore all erased, or undo"
+            )
+        return self._memo.get("place", (target, erased), lambda: target.select(~erased))
+
+    def forget(self) -> None:
+        """Know of none again: files or options have changed."""
+        with self._lock:
+            self._now = None
+
+    def _baked(self, lit: _LitState, weights: LayerWeights) -> tuple[Gaussians, Bool[Tensor, "b"]]:
+        relit = lit.relit
+        if relit is None:
+            assert lit.baked is not None
+            return lit.baked
+        return self._memo.get("baked", (relit, weights), lambda: relit.bake(weights))
+
+    def _flattened(self, state: EditState) -> Gaussians:
+        """The target, with the layers flattened that the objects stand on, which takes longer than a picture."""
+        composite = self._scenes.composite(state)
+        count = composite.kept_count
+        return self._memo.get("flattened", (composite,), lambda: composite.merged()[0].map(lambda rows: rows[:count]))
+
+    def _moved(self, lit: _LitState | None, state: EditState, place: Gaussians) -> Gaussians:
+        """The objects at other places of the target than where they were lit last."""
+        objects = list(state.objects or ())
+        parts = self._lit_objects(lit, state.weights) if lit is not None else {}
+        moved, feet = [], []
+        for index, item in enumerate(objects):
+            path, move = self._scenes.object_path(item), item.target_from_object
+            own = [number for number, (known, _, _) in parts.items() if known == path]
+            if own:
+                number = index if index in own else own[0]
+                _, before, gaussians = parts[number]
+                moved.append(_moved_by(move @ before.inverse(), gaussians))
+            else:
+                moved.append(move.gaussians(self._scenes.gaussians(path)))
+            feet.append((move.points(self._foot(item)), move.scale * self._scenes.placeable_object(item).base.radius))
+        scene = concatenate([place, *moved])
+        for points, radius in feet:
+            _darken(scene.sh, place, points, radius)  # of the new scene alone
+        return scene
+
+    def _lit_objects(self, lit: _LitState, weights: LayerWeights) -> dict[int, tuple[object, Similarity, Gaussians]]:
+        """The lit objects in the target's frame, with file and placement, by their number."""
+
+        def make() -> dict[int, tuple[object, Similarity, Gaussians]]:
+            scene, is_object = self._baked(lit, weights)
+            rows, found = is_object.nonzero()[:, 0], {}
+            items = lit.state.objects or ()
+            counts = [self._scenes.gaussians(self._scenes.object_path(item)).count for item in items]
+            if len(rows) != sum(counts):
+                return {}  # the files of the objects have changed
+            for index, (item, part) in enumerate(zip(items, rows.split(counts), strict=True)):
+                found[index] = (self._scenes.object_path(item), item.target_from_object, scene.select(part))
+            return found
+
+        return self._memo.get("lit objects", (lit, weights), make)
+
+    def _foot(self, item: ObjectPlacement) -> Float[Tensor, "k 3"]:
+        """Points of an object's foot, its own frame."""
+        one = self._scenes.placeable_object(item)
+
+        def make() -> Float[Tensor, "k 3"]:
+            heights = (one.gaussians.means - one.base.point) @ one.base.up
+            points = one.gaussians.means[(heights < _FOOT_SHARE * one.base.height) & (one.gaussians.opacities > 0.3)]
+            return points[:: max(1, len(points) // _FOOT_POINTS)] if len(points) else one.base.point[None]
+
+        return self._scenes.derive(f"foot {self._scenes.object_path(item)}", (one,), make)
+
+
+def _moved_by(move: Similarity, gaussians: Gaussians) -> Gaussians:
+    """The Gaussians at another place; without a turn their colours need no rotation, which takes longest."""
+    if float((move.rotation - torch.eye(3)).abs().max()) > _NO_TURN:
+        return move.gaussians(gaussians)
+    log_scales = gaussians.log_scales + math.log(move.scale)
+    return replace(gaussians, means=move.points(gaussians.means), log_scales=log_scales)
+
+
+def _same_weights(a: EditState, b: EditState) -> bool:
+    return a.weights == b.weights
+
+
+def _darken(sh: Float[Tensor, "n k 3"], place: Gaussians, foot: Float[Tensor, "m 3"], radius: float) -> None:
+    """Draw a contact shadow into the colours of a place, the first rows of `sh`; it fades away from the foot."""
+    width = _SHADOW_WIDTH * radius
+    middle = foot.mean(0)
+    reach = float((foot - middle).norm(dim=1).max()) + 2 * width
+    near = ((place.means - middle).abs().amax(1) < reach).nonzero()[:, 0]
+    if not len(near):
+        return
+    apart = torch.from_numpy(KDTree(foot.numpy()).query(place.means[near].numpy())[0]).float()
+    gain = 1 - _DARKEST * torch.exp(-((apart / max(width, 1e-9)) ** 2))
+    sh[near] = apply_gain(replace(place.select(near), sh=sh[near]), gain[:, None].expand(-1, 3)).sh
 
 
 class Pictures:
-    """Pictures of one project; intermediate results are memoised."""
+    """Pictures of one project."""
 
-    def __init__(self, scenes: SceneCache, relighting: RelitPreview) -> None:
-        """Start with an empty memo."""
-        self._scenes, self._relighting = scenes, relighting
-        self._memo = Memo()
-        self._lock = threading.RLock()
+    def __init__(self, scenes: SceneCache) -> None:
+        """Draw nothing yet."""
+        self._scenes, self.lit, self._memo = scenes, LitScenes(scenes), Memo()
 
-    def view(
-        self, kind: PictureKind, state: EditState, camera: Cameras, *, draft: bool = False, budget: int | None = None
-    ) -> Picture:
-        """Render one picture of the target.
+    def draw(
+        self, kind: Kind, state: EditState, camera: Cameras, photo: int | None = None, *, is_dragged: bool = False
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """Draw the target; ValueError where what is needed does not exist yet."""
+        if kind == "photo":
+            return self._target_photo(camera, photo)
+        if kind == "shadow":
+            return self._shadow(state, camera)
+        return draw(self.lit.scene(state, is_dragged=is_dragged) if kind == "lit" else self._scene(kind, state), camera)
 
-        A `draft` needs no full light transfer; of a coloured picture at most `budget` Gaussians are drawn.
-        """
-        with self._lock:
-            if kind == "Photograph":
-                return Picture(self._photograph(camera))
-            if kind == "Shadow layer":
-                return Picture(self._shadow(state, camera, draft=draft))
-            scene = self._scene(kind, state, draft=draft)
-            if budget is not None and scene.count > budget:
-                scene = self._memo.get(
-                    f"coarse {kind}", (scene,), lambda: scene.select(largest_coverage_indices(scene, budget))
-                )
-            found = render(scene, camera, outputs=frozenset({"color", "depth"}))
-            # where little is drawn, depth is that of haze
-            depth = torch.where(found.alpha[0] > 0.5, found.depth[0], torch.inf)
-            return Picture(_bytes(found.color[0]), depth.numpy())
+    def _scene(self, kind: Kind, state: EditState) -> Gaussians:
+        if kind == "result":
+            if not self._scenes.files.result.is_file():
+                raise ValueError("There is no result yet: press Update result in Run.")
+            return self._scenes.gaussians(self._scenes.files.result)
+        return self.lit.pasted(state) if kind == "pasted" else self.lit.place(state)
 
-    def of_source(
-        self, kind: PictureKind, state: EditState, which: Bool[Tensor, "n"] | None, camera: Cameras, photo: int | None
-    ) -> Picture:
-        """Render the source, or the Gaussians selected by `which` alone, or the source with them tinted.
+    def _shadow(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+        relit = self.lit.relit(state)
+        if relit is None:
+            raise ValueError(
+                "The light is being computed." if self._scenes.files.transfers_light else "The light transfer is off."
+            )
+        # a ratio of 1 is mid grey, so that darkening and brightening both show
+        layers = (0.5 * relit.ratio(state.weights)).clamp(0, 1)
+        found = render(relit.gaussians, camera, outputs=frozenset(), features=layers)
+        return to_bytes(found.features[0] + 0.5 * (1 - found.alpha[0])[..., None])
 
-        Where `photo` is the number of a photo of the capture, it stands in place of the rendered picture, as large as
-        it fits, with what was clicked in it.
-        """
-        scene = self._scenes.gaussians(self._scenes.files.source_scene)
-        if kind == "Object alone":
-            return Picture(_bytes(render(scene if which is None else scene.select(which), camera).color[0]))
-        flags = None if kind == "Source" or which is None else which[:, None].to(scene.means)
+    def _target_photo(self, camera: Cameras, photo: int | None) -> UInt8[np.ndarray, "h w 3"]:
+        capture = self._scenes.capture(self._scenes.files.target_cameras)
         if photo is None:
-            found = render(scene, camera, features=flags)
-            pixels = _bytes(found.color[0])
-            return Picture(pixels if flags is None else _tinted(pixels, found.features[0, ..., 0]))
-        capture = self._scenes.capture(self._scenes.files.source_cameras)
-        pixels, size = self.photo(photo)
-        view = PhotoView(size, (camera.width, camera.height))
-        if flags is not None:
-            width = view.drawn_size[0]
-            posed = capture.cameras[photo].resized(width / capture.cameras[photo].width)
-            share = render(scene, posed, outputs=frozenset(), features=flags).features[0, ..., 0].numpy()
-            share = cv2.resize(share, (pixels.shape[1], pixels.shape[0]), interpolation=cv2.INTER_LINEAR)
-            pixels = _tinted(pixels, torch.from_numpy(share))
-        return Picture(view.drawn(pixels, prompt_of(state.prompts, capture.cameras.names[photo])))
+            raise ValueError("Move to a photo to see it: under More, View.")
+        pixels = to_bytes(capture.image(photo))
+        return PhotoView((pixels.shape[1], pixels.shape[0]), (camera.width, camera.height)).drawn(pixels)
 
-    def photo(self, index: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
+    # the source
+
+    def source_photo(self, index: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
         """A photo of the source, upright and at most 1920 pixels long, and its own width and height."""
-        path = self._scenes.capture(self._scenes.files.source_cameras).image_paths[index]
+        path = self._scenes.photo(self._scenes.files.source_cameras, index)
         stamp = path.stat().st_mtime_ns if path.is_file() else 0
         return self._scenes.derive("photo", (str(path), stamp), lambda: read_upright(path, _LONGEST_PX))
 
-    def without_object(self, state: EditState, index: int, camera: Cameras) -> Picture:
-        """The target with all objects but one, pasted: what stays the same while that one is dragged."""
-        objects = state.objects or ()
-        rest = replace(state, objects=(*objects[:index], *objects[index + 1 :]))
-        if not rest.objects:
-            return self.view("Target alone", rest, camera)
-        found = render(self._scenes.composite(rest).bake()[0], camera, outputs=frozenset({"color", "depth"}))
-        depth = torch.where(found.alpha[0] > 0.5, found.depth[0], torch.inf)
-        return Picture(_bytes(found.color[0]), depth.numpy())
+    def draw_source(
+        self, which: Bool[Tensor, "n"] | None, camera: Cameras, *, photo: int | None, alone: bool
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """Draw the source with the selected Gaussians tinted, or them alone; a photo stands in place of the scene."""
+        scene = self._scenes.gaussians(self._scenes.files.source_scene)
+        if alone and which is not None:
+            return draw(scene.select(which), camera)
+        flags = None if which is None or not bool(which.any()) else which[:, None].to(scene.means)
+        if photo is None:
+            found = render(scene, camera, features=flags)
+            pixels = to_bytes(found.color[0])
+            return pixels if flags is None else _tinted(pixels, found.features[0, ..., 0].numpy())
+        pixels, size = self.source_photo(photo)
+        view = PhotoView(size, (camera.width, camera.height))
+        out = view.drawn(pixels)
+        if flags is None:
+            return out
+        cameras = self._scenes.cameras(self._scenes.files.source_cameras)
+        width, height = view.drawn_size
+        posed = cameras[photo].resized(width / cameras[photo].width)
+        share = render(scene, posed, outputs=frozenset(), features=flags).features[0, ..., 0].numpy()
+        (left, top), whole = (round(x) for x in view.corner), np.zeros(out.shape[:2], np.float32)
+        whole[top : top + height, left : left + width] = cv2.resize(share, (width, height))
+        return _tinted(out, whole)
 
-    def _scene(self, kind: PictureKind, state: EditState, *, draft: bool) -> Gaussians:
-        if kind == "Result":
-            if not self._scenes.files.result.is_file():
-                raise ValueError("Result: expected a finished run, found none yet")
-            return self._scenes.gaussians(self._scenes.files.result)
-        if kind == "Light transfer":
-            return self._relighting.scene(state, draft=draft)
-        composite = self._scenes.composite(state)
-        if kind == "Target alone":
-            inputs = (composite.target, composite.erased)
-            return self._memo.get("target alone", inputs, lambda: composite.target.select(~composite.erased))
-        return self._relighting.pasted(composite)[0]
+    def outline(self, state: EditState, photo: int) -> list[list[tuple[float, float]]]:
+        """The outline by the clicks in one photo, as the first round of `segment` finds it, over the photo's sides.
 
-    def _shadow(self, state: EditState, camera: Cameras, *, draft: bool) -> UInt8[np.ndarray, "h w 3"]:
-        relighting = self._relighting
-        if not self._scenes.files.transfers_light:
-            raise ValueError(f"Shadow layer: expected the physical transfer, found {relighting.light_mode_note()}")
-        relit = relighting.layers(state, draft=draft)
-        layers = self._memo.get("layers", (relit, state.weights), lambda: relit.ratio(state.weights))
-        # a ratio of 1 is mid grey, so that darkening and brightening both show
-        rendered = render(relit.gaussians, camera, outputs=frozenset(), features=(0.5 * layers).clamp(0, 1))
-        return _bytes(rendered.features[0] + 0.5 * (1 - rendered.alpha[0])[..., None])
-
-    def _photograph(self, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
-        capture = self._scenes.capture(self._scenes.files.target_cameras)
-        if camera.names[0] not in capture.cameras.names:
-            raise ValueError("Photograph: expected one of the target's cameras, found a free view; step to a camera")
-        image = capture.image(capture.cameras.names.index(camera.names[0]))
-        return cv2.resize(_bytes(image), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-
-
-def with_object(background: Picture, object_: Gaussians, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture with an object in front of what is farther away in it."""
-    found = render(object_, camera, outputs=frozenset({"color", "inverse_depth"}))
-    alpha = found.alpha[0].numpy()
-    if background.depth is not None:
-        # the mean of inverse depth: faint pixels of the outline have no median depth
-        is_nearer = found.inverse_depth[0].numpy() > alpha / background.depth
-        alpha = np.where(is_nearer, alpha, 0)
-    color = found.color[0].clamp(0, 1).numpy()
-    share = np.where(alpha > 0, 1 - alpha, 1)[..., None]
-    out = background.pixels * share + 255 * np.where(alpha[..., None] > 0, color, 0)
-    return out.clip(0, 255).astype(np.uint8)
+        ValueError where no object is found.
+        """
+        cameras = self._scenes.cameras(self._scenes.files.source_cameras)
+        scene = self._scenes.gaussians(self._scenes.files.source_scene)
+        small = cameras.resized(min(1.0, CUT_SIDE_PX / int(cameras.sizes.max())))
+        prompts: dict[int, ViewPrompt] = {}
+        for index, name in enumerate(cameras.names):
+            given = prompt_of(state.prompts, name)
+            if len(given.inside) or len(given.outside) or given.box is not None:
+                size, here = self.source_photo(index)[1], small.sizes[index].tolist()
+                prompts[index] = given.scaled(here[0] / size[0], here[1] / size[1])
+        # not in the scenes' memo, for which pictures would wait
+        selected, _ = self._memo.get(
+            "seed", (scene, state.prompts), lambda: seed_selection(scene, small, prompts=prompts)
+        )
+        lifted = view_operator(scene, small[photo], RenderOptions()).blend(selected.float()[:, None])[..., 0]
+        image = torch.from_numpy(self.source_photo(photo)[0]).float() / 255
+        image = resize(image, small[photo].width, small[photo].height)
+        mask = grabcut_mask(image, lifted, prompts.get(photo, ViewPrompt())).numpy().astype(np.uint8)
+        found = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)[0]
+        sides = np.array([mask.shape[1], mask.shape[0]])
+        return [[(round(float(x), 4), round(float(y), 4)) for x, y in (line[:, 0] + 0.5) / sides] for line in found]
 
 
-def _tinted(pixels: UInt8[np.ndarray, "h w 3"], share: Float[Tensor, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+def draw(scene: Gaussians, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+    """A scene in a view."""
+    with torch.inference_mode():
+        return to_bytes(render(scene, camera).color[0])
+
+
+def to_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture in [0, 1] in bytes."""
+    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def _tinted(pixels: UInt8[np.ndarray, "h w 3"], share: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """The picture with a colour over what is selected, and a line around it."""
-    inside = share.clamp(0, 1).numpy()[..., None]
+    inside = share.clip(0, 1)[..., None]
     out = pixels * (1 - 0.4 * inside) + 0.4 * inside * 255 * np.array(TINT)
     out = np.ascontiguousarray(out.clip(0, 255).astype(np.uint8))
     edges = cv2.findContours((inside[..., 0] > 0.5).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
     r, g, b = (255 * value for value in TINT)
     cv2.drawContours(out, edges, -1, (r, g, b), max(2, pixels.shape[1] // 500), cv2.LINE_AA)
     return out
-
-
-def jpeg(pixels: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
-    """A picture as JPEG, of a quality from 0 to 100."""
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality]
-    return cv2.imencode(".jpg", np.ascontiguousarray(pixels[..., ::-1]), options)[1].tobytes()
-
-
-def with_badge(pixels: UInt8[np.ndarray, "h w 3"], text: str) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture with a word in its lower left corner."""
-    out = np.ascontiguousarray(pixels.copy())
-    size = max(0.4, pixels.shape[1] / 2400)
-    (width, height), base = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
-    x, y = round(12 * size) + 24, pixels.shape[0] - round(14 * size) - 4
-    corner, end = (x - 6, y - height - 6), (x + width + 6, y + base + 2)
-    patch = out[max(0, corner[1]) : end[1], max(0, corner[0]) : end[0]]
-    patch[:] = patch // 3
-    cv2.putText(out, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, (235, 235, 235), 1, cv2.LINE_AA)
-    return out
-
-
-def _bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).numpy()

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -140,28 +140,9 @@ class RelitPreview:
                 shared = (composite.target, composite.erased, *sources)
                 self._memo.get("drafts prepared", shared, lambda: self._draft(state))
 
-    def scene(self, state: EditState, *, draft: bool = False) -> Gaussians:
-        """The scene that the step `relight` writes, or a draft of it."""
-        composite, light_mode = self._scenes.composite(state), self._scenes.files.light_mode
-        if light_mode == "off":
-            return self.pasted(composite)[0]
-        relit = self.layers(state, draft=draft)
-        return self._memo.get("scene", (relit, state.weights), lambda: relit.bake(state.weights)[0])
-
     def layers(self, state: EditState, *, draft: bool) -> Relit:
         """The layers of the light transfer, or the best draft of them."""
         return (self.best(state) or self.draft(state)) if draft else self.relit(state)
-
-    def pasted(self, composite: Composite) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-        """The scene that the step `compose` writes, and which Gaussians belong to objects."""
-        return self._memo.get("pasted", (composite,), composite.bake)
-
-    def light_mode_note(self) -> str:
-        """What the preview `Light transfer` shows where project.toml selects no physical transfer; else empty."""
-        light_mode = self._scenes.files.light_mode
-        if light_mode == "transfer":
-            return ""
-        return f"nothing: the object as captured, as set in project.toml ([relight] light = {light_mode})"
 
     def _make_once(
         self, name: str, state: EditState, make: Callable[[], Relit], *, lock: AbstractContextManager[object]

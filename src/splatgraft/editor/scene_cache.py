@@ -1,7 +1,8 @@
 """A project's scenes and cameras in memory, read again when a file changes, and composites of the placed objects."""
 
+import json
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +20,12 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.editor.memo import Memo
 from splatgraft.editor.placement import PlaceableObject
 from splatgraft.editor.project import ProjectFiles
-from splatgraft.editor.scene_sample import SceneSample, read_sample
 from splatgraft.editor.state import EditState
 from splatgraft.folders.clock_sun import clock_sun_path, read_clock_sun
 from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.project.gaussian_flags import read_flags
 from splatgraft.project.placement import ObjectPlacement
 from splatgraft.relighting import SourceScene
-
-_LARGE_BYTES = 12_000_000
-"""A file below is read within a tenth of a second."""
 
 
 class SceneCache:
@@ -37,43 +34,14 @@ class SceneCache:
     def __init__(self, files: ProjectFiles) -> None:
         """Start empty."""
         self.files = files
-        self.on_read: Callable[[], None] = lambda: None
-        """Called in a thread when a scene that `at_hand` asked for is there, or could not be read."""
         self._contents: dict[tuple[str, Path], tuple[tuple[int, int], Any]] = {}
         self._derived = Memo()
         self._lock = threading.RLock()
         self._file_locks: dict[tuple[str, Path], threading.RLock] = {}
-        self._reading: set[Path] = set()
-        self._failed: set[Path] = set()
 
     def gaussians(self, path: Path) -> Gaussians:
         """The scene in a file."""
         return self._read("gaussians", path, read_gaussians)
-
-    def at_hand(self, paths: Iterable[Path]) -> bool:
-        """Whether `gaussians` answers at once; scenes for which it would not are read in the background.
-
-        A file that could not be read counts as at hand, so that whoever uses it reports what is wrong with it.
-        """
-        with self._lock:
-            missing = [path for path in set(paths) - self._failed if not self._is_quick(path)]
-            started = [path for path in missing if path not in self._reading]
-            self._reading |= set(started)
-        for path in started:
-            # a thread for each, so that a small object does not wait for a large scene
-            threading.Thread(target=self._read_ahead, args=(path,), name="splatgraft scene", daemon=True).start()
-        return not missing
-
-    def reading_note(self, path: Path) -> str:
-        """What the page says while a scene is read."""
-        sample = self.sample(path)
-        if sample is None:
-            return "The scene is being read."
-        return f"{sample.total:,} Gaussians are being read. A sample is shown meanwhile."
-
-    def sample(self, path: Path) -> SceneSample | None:
-        """Some of a scene's Gaussians, without reading all; None where the file's layout does not allow it."""
-        return self._read("sample", path, read_sample)
 
     def cameras(self, path: Path) -> Cameras:
         """The cameras in a file."""
@@ -82,6 +50,15 @@ class SceneCache:
     def capture(self, path: Path) -> PosedImages:
         """The posed images whose cameras are in a file."""
         return self._read("capture", path, lambda path: read_capture(path.parent))
+
+    def photo(self, path: Path, index: int) -> Path:
+        """The photo of a camera; the capture, which names it too, cannot be read where too many masks are missing."""
+        return self._read("photos", path, lambda path: _named(path, "file_path"))[index] or path
+
+    def missing_masks(self, path: Path) -> list[Path]:
+        """The masks that a transforms.json names, and that do not exist."""
+        masks = self._read("masks", path, lambda path: _named(path, "mask_path"))
+        return [mask for mask in masks if mask is not None and not mask.is_file()]
 
     def segmented(self) -> Bool[Tensor, "n"] | None:
         """Flags of the source's Gaussians in the last result of `segment`; None where there is none."""
@@ -94,11 +71,6 @@ class SceneCache:
     def object_path(self, item: ObjectPlacement) -> Path:
         """The file of a placed object."""
         return item.object_path or self.files.object
-
-    def base_files(self, objects: Sequence[ObjectPlacement]) -> tuple[Path, ...]:
-        """The scenes that `placeable_object` reads for these objects."""
-        paths = tuple(self.object_path(item) for item in objects)
-        return (*paths, self.files.surroundings) if self.files.object in paths else paths
 
     def placeable_object(self, item: ObjectPlacement) -> PlaceableObject:
         """A placed object with its base."""
@@ -127,10 +99,6 @@ class SceneCache:
 
         return self.derive("composite", (target, state.objects, state.erased), make)
 
-    def complement(self, name: str, flags: Bool[Tensor, "n"]) -> Bool[Tensor, "n"]:
-        """The inverted flags; the same tensor for the same flags of that name."""
-        return self.derive(f"complement {name}", (flags,), lambda: ~flags)
-
     def source_scenes(self, state: EditState) -> list[SourceScene | None]:
         """The source scene of each placed object, as in the step `relight`; None for objects from other files."""
         own = [self.object_path(item) == self.files.object for item in state.objects or ()]
@@ -153,11 +121,6 @@ class SceneCache:
         with self._lock:
             return self._derived.get(name, inputs, make)
 
-    def _is_quick(self, path: Path) -> bool:
-        """Whether a scene is in memory, or its file is small or missing."""
-        stamp, cached = _stamp(path), self._contents.get(("gaussians", path))
-        return stamp[1] < _LARGE_BYTES or (cached is not None and cached[0] == stamp)
-
     def _read(self, kind: str, path: Path, read: Callable[[Path], Any]) -> Any:
         # one lock per file: while a large scene is read, others are still to be had
         with self._file_locks.setdefault((kind, path), threading.RLock()):
@@ -167,16 +130,13 @@ class SceneCache:
                 self._contents[kind, path] = cached
             return cached[1]
 
-    def _read_ahead(self, path: Path) -> None:
-        try:
-            self.gaussians(path)
-        except (ValueError, OSError, MemoryError):
-            self._failed.add(path)
-        with self._lock:
-            self._reading.discard(path)
-        self.on_read()
-
 
 def _stamp(path: Path) -> tuple[int, int]:
     """Time and size of a file; zeros where there is none."""
     return (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)
+
+
+def _named(transforms: Path, key: str) -> list[Path | None]:
+    """The file that each frame of a transforms.json, as the step `capture` writes it, names under a key."""
+    content = json.loads(transforms.read_text(encoding="utf-8")) if transforms.is_file() else {"frames": []}
+    return [transforms.parent / frame[key] if key in frame else None for frame in content["frames"]]

@@ -1,5 +1,6 @@
-"""An open project: its edits with undo history, saved after every change, and its scenes, pictures and job."""
+"""An open project: its edits with undo history, saved after every change, and its scenes and job."""
 
+import errno
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,10 +15,8 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.history import History, StateStore
 from splatgraft.editor.jobs import Jobs
-from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.placement import ObjectSize, PlaceableObject
 from splatgraft.editor.project import PROBLEM, Project, ProjectFiles, RenderedViews, in_words
-from splatgraft.editor.relit_preview import RelitPreview
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState, check_height_cm, check_state
 from splatgraft.editor.state_files import as_written, read_state, state_files, write_state
@@ -45,19 +44,33 @@ class Session:
         self.project = project
         self.files: ProjectFiles = files
         self.scenes = SceneCache(files)
-        self.relighting = RelitPreview(self.scenes)
-        self.pictures = Pictures(self.scenes, self.relighting)
         self.jobs = Jobs(files.root / EDITOR_FOLDER)
         self._store = StateStore(files.root, project_folder=files.file.parent)
         self._stamps = stamps_of(files.file)
         self.state: EditState = read_state(files.file)
         """The current edits; `change` replaces them."""
-        saved, now = self._store.read_history(), self._store.save(self.state)
+        self.unsaved: str | None = None
+        """Why nothing can be saved at present; None where it can."""
+        saved, now = self._store.read_history(), self._store.name(self.state)
         # a change of the files while no editor was open is one more step
         self.history = History(now) if saved is None else saved if saved.present == now else saved.pushed(now)
-        self._store.save_history(self.history)
         self._composed: tuple[int, tuple[ObjectPlacement, ...]] = (0, ())
         self._lock = threading.RLock()
+        self.save_again()
+
+    def save_again(self) -> bool:
+        """Try to save the state and the history; whether there was room on the disk."""
+        with self._lock:
+            try:
+                self._store.save(self.state)
+                self._store.save_history(self.history)
+            except (ValueError, OSError) as error:
+                if not disk_full(error):
+                    raise
+                self.unsaved = "Disk full: nothing can be saved"
+                return False
+            self.unsaved = None
+            return True
 
     def change(self, state: EditState) -> None:
         """Save a new state as one undo step; an unchanged one adds none.
@@ -190,17 +203,14 @@ class Session:
         """The current state with the objects that `compose` placed filled in."""
         return self.state if self.state.objects is not None else replace(self.state, objects=self.objects())
 
-    def placed_scenes(self) -> tuple[Path, ...]:
-        """The files of the target and of the placed objects."""
-        return (self.files.target_scene, *(self.scenes.object_path(item) for item in self.objects()))
-
     def placeable_object(self, index: int) -> PlaceableObject:
         """A placed object with its base."""
         return self.scenes.placeable_object(self.objects()[index])
 
-    def up(self) -> Float[Tensor, "3"]:
-        """Up direction of the target."""
-        return estimate_up(self.scenes.cameras(self.files.target_cameras))
+    def up(self, side: str = "target") -> Float[Tensor, "3"]:
+        """Up direction of the target, or of the source."""
+        cameras = self.scenes.cameras(self.files.source_cameras if side == "source" else self.files.target_cameras)
+        return self.scenes.derive(f"up {side}", (cameras,), lambda: estimate_up(cameras))
 
     def set_placement(self, index: int, target_from_object: Similarity) -> None:
         """Change the placement of one object."""
@@ -261,6 +271,15 @@ class Session:
             return None
         words = in_words(name, reason)
         return words if words != reason else f"{name}: {reason}"
+
+
+def disk_full(error: BaseException | None) -> bool:
+    """Whether an error was caused by a lack of room on the disk."""
+    while error is not None:
+        if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def stamps_of(project: Path) -> Stamps:

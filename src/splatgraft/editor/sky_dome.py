@@ -80,15 +80,15 @@ class SkyDome:
             peak = max(*source.irradiance, 1e-9)
             r, g, b = (round(255 * max(0.0, value / peak) ** (1 / 2.2)) for value in source.irradiance)
             dots.append(
-                f'<circle class="sg-light" data-source="{index}" cx="{x:.1f}" cy="{y:.1f}" '
+                f'<circle class="light" data-source="{index}" cx="{x:.1f}" cy="{y:.1f}" '
                 f'r="{5 + 16 * math.sqrt(share):.1f}" fill="rgb({r},{g},{b})" stroke="#222" stroke-width="2">'
                 f"<title>{html.escape(source.name)}, {self.words(source)}</title></circle>"
             )
         return (
-            f'<svg class="sg-dome" viewBox="{-_SIDE} {-_SIDE} {2 * _SIDE} {2 * _SIDE}" '
-            'xmlns="http://www.w3.org/2000/svg"><defs><clipPath id="sg-sky">'
+            f'<svg class="dome" viewBox="{-_SIDE} {-_SIDE} {2 * _SIDE} {2 * _SIDE}" '
+            'xmlns="http://www.w3.org/2000/svg"><defs><clipPath id="sky-clip">'
             f'<circle r="{_RADIUS}"/></clipPath></defs><image href="{self._ambient(light)}" x="{-_RADIUS}" '
-            f'y="{-_RADIUS}" width="{2 * _RADIUS}" height="{2 * _RADIUS}" clip-path="url(#sg-sky)"/>'
+            f'y="{-_RADIUS}" width="{2 * _RADIUS}" height="{2 * _RADIUS}" clip-path="url(#sky-clip)"/>'
             f'<circle r="{_RADIUS}" fill="none" stroke="#888"/><circle r="{_RADIUS / 2}" fill="none" stroke="#8886"/>'
             f'{"".join(dots)}<text y="-92">far side</text><text y="99">you</text></svg>'
         )

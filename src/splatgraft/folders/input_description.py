@@ -67,7 +67,7 @@ def _described(path: Path) -> InputDescription:
         return _photos(path, count_archived_photos(path), "unpacked first")
     if path.is_file():
         return InputDescription(
-            "video", f"{describe_video(path)}: frames are taken, poses are found, and a scene is trained"
+            "video", f"{describe_video(path)}: frames are taken, camera positions will be found and the scene built"
         )
     return _folder_of_photos(path)
 
@@ -92,4 +92,5 @@ def _folder_of_photos(path: Path) -> InputDescription:
 def _photos(path: Path, count: int, more: str) -> InputDescription:
     if count < MIN_VIEWS:
         raise ValueError(f"{path}: expected at least {MIN_VIEWS} photos, found {count}")
-    return InputDescription("photos", f"{count} photos, {more}: poses are found, and a scene is trained")
+    following = "ready: camera positions will be found and the scene built"
+    return InputDescription("photos", f"{count} photos, {more}; {following}")

@@ -1,0 +1,713 @@
+"""The editor: the open project, its windows and steps, and what they show. `Server` tells it what windows send."""
+
+import contextlib
+import json
+import queue
+import re
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from splatgraft.core.bounds import bounding_sphere
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.editor.form import Form
+from splatgraft.editor.jobs import JobState, seconds_left, seconds_left_in_job
+from splatgraft.editor.light_panel import LightPanel
+from splatgraft.editor.light_process import LightProcess, Lit
+from splatgraft.editor.open_panel import OpenPanel
+from splatgraft.editor.orbit import FreeSpace, Orbit, through, typical_distance
+from splatgraft.editor.panel import Panel, Pointer
+from splatgraft.editor.pictures import Kind, Pictures
+from splatgraft.editor.place_panel import PlacePanel
+from splatgraft.editor.project import Project
+from splatgraft.editor.result_panels import RunPanel, SharePanel
+from splatgraft.editor.select_panel import SelectPanel
+from splatgraft.editor.server import Server, Window
+from splatgraft.editor.session import Session, Stamps, disk_full, stamps_of
+from splatgraft.editor.sharing import served_file, written_exports
+from splatgraft.editor.state import EditState
+from splatgraft.editor.stream import Stream, View
+from splatgraft.editor.worker import LatestOnlyWorker
+from splatgraft.runtime.files import os_error_line
+
+STEPS = ("Open", "Select", "Place", "Light", "Run", "Share")
+KINDS: dict[str, Kind] = {
+    "With its new light": "lit",
+    "Pasted, unlit": "pasted",
+    "Result": "result",
+    "Place alone": "place",
+    "Shadow alone": "shadow",
+    "Photo": "photo",
+}
+"""Kinds of pictures of the target, by the name that a user chooses."""
+_POLL_SECONDS = 0.4
+_MARK_SECONDS = 1.0  # how long nothing must change before the steps are marked anew
+_CURRENT, _DONE, _STALE, _NEXT = "●", "✓", "↻", "›"
+_WORDS = {"do": "id", "live": "id", "key": "key", "step": "to"}
+"""Kinds of messages about the panel, with the field that names something."""
+_MAX_ACTIONS = 200  # messages that wait
+_UPLOADS_FOLDER = "uploads"
+_GREY = 48  # of a picture that cannot be drawn, 0 to 255
+_FULL_DISK = "Disk full: not saved."
+
+
+class Editor:
+    """One project in all windows of a server."""
+
+    def __init__(self, server: Server, project: Project) -> None:
+        """Open the project where there is one, and serve it."""
+        self.server, self.project = server, project
+        self.lock = threading.RLock()
+        self.session: Session | None = None
+        self.problem: str | None = None
+        """Why the project could not be opened; None where it could, or where there is none."""
+        self.step = "Open"
+        self.live: EditState | None = None
+        """What is shown during a drag, in place of the saved state."""
+        self.kind, self.before = "With its new light", "Pasted, unlit"
+        self.status, self.is_bad, self.is_unsaved = "", False, False
+        self.offer: dict[str, Any] | None = None
+        """A file that the window that edits is to download."""
+        self.pictures: Pictures | None = None
+        self._light: LightProcess | None = None
+        self._form = Form()
+        self._seen: Stamps = ()
+        self._marks: dict[str, str] = {}
+        self._caption, self._space = "", (None, None)
+        self._ups: dict[str, tuple[Any, np.ndarray]] = {}
+        self._last_job = ""
+        self._panel = ""
+        self._is_open = True
+        self._actions: queue.Queue[tuple[Window, dict[str, Any]] | None] = queue.Queue(_MAX_ACTIONS)
+        self._moves: dict[str, Any] | None = None
+        """The newest move of the pointer, which replaces earlier ones that wait."""
+        self.stream = Stream(self, self._drawing_failed)
+        self._marker = LatestOnlyWorker(self._find_marks, self._failed)
+        self.panels: dict[str, Panel] = {
+            "Open": OpenPanel(self),
+            "Select": SelectPanel(self),
+            "Place": PlacePanel(self),
+            "Light": LightPanel(self),
+            "Run": RunPanel(self),
+            "Share": SharePanel(self),
+        }
+        server.attach(self)
+        with self.lock:
+            self.open_project()
+        self._threads = [
+            threading.Thread(target=work, name=f"splatgraft {name}", daemon=True)
+            for name, work in (("actions", self._act), ("poll", self._poll_loop))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """End all threads and the light process, but no job."""
+        self._is_open = False
+        self._actions.put(None)
+        for closed in (self.stream, self._marker, self._light, *self.panels.values()):
+            if closed is not None:
+                closed.close()
+
+    # the project
+
+    def open_project(self) -> None:
+        """Open the project where there is one, at the step that comes next; what prevents it is kept as `problem`."""
+        self.session, self.problem, self._seen = None, None, stamps_of(self.project.file)
+        if self._light is not None:
+            self._light.close()
+        self._light = self.pictures = None
+        for view in self.stream.views:
+            view.orbits.clear()
+        try:
+            if self.project.files() is not None:
+                self.session = session = Session(self.project)
+                self.pictures = Pictures(session.scenes)
+                self._light = LightProcess(self.project, self._lit, self._light_failed)
+        except (ValueError, OSError) as error:
+            self.problem = " ".join(str(error).split())
+        session = self.session
+        files = None if session is None else session.files
+        if session is None or files is None or not files.source_scene.is_file() or not files.target_scene.is_file():
+            self.show_step("Open")
+            return
+        if files.relit.is_file() and session.why_stale("relight") is None and self.pictures is not None:
+            with contextlib.suppress(ValueError, OSError):  # then it is computed
+                self.pictures.lit.adopt(session.placed_state())
+        self.show_step("Place" if files.object.is_file() else "Select")
+
+    def require_session(self) -> Session:
+        """The open project; ValueError where there is none."""
+        if self.session is None:
+            raise ValueError("Start a project first.")
+        return self.session
+
+    def shown_state(self) -> EditState:
+        """The state that pictures show: that of a drag, else the saved one."""
+        return self.live or self.require_session().placed_state()
+
+    def show_live(self, state: EditState | None) -> None:
+        """Show a state during a drag; None: the saved one."""
+        self.live = state
+        self._want_light()
+        self.stream.touch(moving=True)
+
+    def run(self, to: str, title: str) -> None:
+        """Start a job that runs the stale steps up to `to`."""
+        session = self.require_session()
+        session.start_job(session.project.run_words(to), title)
+        self.say(f"{title}: started; it continues if you close this page")
+
+    # what windows see
+
+    def say(self, sentence: str, *, bad: bool = False) -> None:
+        """Show one sentence in the status line."""
+        self.status, self.is_bad = " ".join(sentence.split()), bad
+
+    def refresh(self) -> None:
+        """Describe the panel anew, and draw."""
+        with self.lock:
+            form = Form()
+            with self.reported():
+                self.panels[self.step].build(form)
+            if self.session is not None and self.step != "Select":
+                form.more()
+                self._add_view(form)
+            form.hidden("cancel_job", self.cancel_job)
+            self._form = form
+            self._want_light()
+            self._send_panel()
+            self.stream.touch()
+            self._marker.submit(self.session)
+
+    def _add_view(self, form: Form) -> None:
+        """Controls of the picture, which all steps of the target share."""
+        form.choice("kind", "Picture", self.kind, list(KINDS), lambda value: setattr(self, "kind", value))
+        form.choice(
+            "before", "Compare with", self.before, list(KINDS), lambda value: setattr(self, "before", value),
+            hint="Left of the divider, and while Tab is held",
+        )  # fmt: skip
+        self.add_photos(form)
+
+    def add_photos(self, form: Form) -> None:
+        """The slider that steps through the photos."""
+        cameras, view = self.cameras(), self.editing()
+        if cameras is not None and len(cameras) > 1 and view is not None:
+            photo = 1 if view.photo is None else view.photo + 1
+            hint = "Look from the place of a photo; also by the arrow keys"
+            ends = (1, len(cameras), 1)
+            form.slider("photo", "Photo", photo, ends, lambda value: self.to_photo(int(value) - 1), hint=hint)
+
+    def _send_panel(self) -> None:
+        session = self.session
+        saved = "" if session is None else "not saved" if self.is_unsaved or session.unsaved else "saved"
+        panel = {
+            "t": "panel",
+            "project": "no project yet" if session is None else session.files.file.parent.name,
+            "saved": saved,
+            "steps": [[name, _CURRENT if name == self.step else self._marks.get(name, "")] for name in STEPS],
+            "controls": self._form.controls,
+            "status": self.status if self.status or session is None else session.unsaved or "",
+            "bad": self.is_bad or bool(session and session.unsaved and not self.status),
+            "undo": bool(session and session.history.past),
+            "redo": bool(session and session.history.future),
+            "job": self._job(),
+            **self.panels[self.step].tools(),
+        }
+        for index, view in enumerate(self.stream.views):
+            own = {"window": view.window.number, "editing": index == 0, "offer": self.offer if index == 0 else None}
+            view.window.send("panel", json.dumps(panel | own))
+
+    def editing(self) -> View | None:
+        """The window that edits; None where none is open."""
+        return self.stream.views[0] if self.stream.views else None
+
+    # drawing, in the thread of the stream
+
+    def draw(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], dict[str, Any]]:
+        """A picture of a window's view, and what lies over it."""
+        panel, pictures, problem = self.panels[self.step], self.pictures, ""
+        over: dict[str, Any] = {}
+        try:
+            if pictures is None:
+                raise ValueError("There is nothing to see yet.")
+            pixels, caption = panel.picture(view, camera)
+            over = panel.overlay(view, camera)
+        except (ValueError, OSError) as error:
+            problem, caption = " ".join(str(error).split()), ""
+            pixels = np.full((camera.height, camera.width, 3), _GREY, np.uint8)
+        return pixels, over | {"caption": caption, "problem": problem, "step": self.step}
+
+    def draw_target(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
+        """The target as it is chosen, with the picture before left of the divider, and the caption."""
+        pictures, state, kind = self.pictures, self.shown_state(), KINDS[self.kind]
+        assert pictures is not None
+        column = round(view.split * camera.width)
+        parts = []
+        for name, left, right in ((self.before, 0, column), (self.kind, column, camera.width)):
+            if right > left:
+                part = camera if right - left == camera.width else camera.cropped([(left, 0, right, camera.height)])
+                if KINDS[name] == "photo":
+                    parts.append(pictures.draw("photo", state, camera, view.photo)[:, left:right])
+                else:
+                    parts.append(pictures.draw(KINDS[name], state, part, is_dragged=self.live is not None))
+        caption = "full quality"
+        if kind in ("lit", "shadow") and state.objects:
+            stage = pictures.lit.stage(state)
+            words = {"": "old light: computing", "draft": "draft of the light", "refined": "light: nearly done"}
+            caption = (
+                words.get(stage, "full quality")
+                if self.require_session().files.transfers_light
+                else "light transfer off"
+            )
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, 1), caption
+
+    def orbit(self, view: View) -> Orbit | None:
+        """Where a window looks from, kept in free space; None where there is nothing to see."""
+        side, session = self.side, self.session
+        if session is None:
+            return None
+        found = view.orbits.get(side)
+        if found is None:
+            cameras = self.cameras()
+            if cameras is None:
+                return None
+            found = view.orbits[side] = through(cameras[0], typical_distance(cameras))
+            view.photo = 0
+        if view.photo is not None or side == "source":
+            return found
+        space = self._free_space()
+        if space is None:
+            return found
+        kept = space.kept(found)
+        # the wish for a distance stays, so that the view goes back behind what it has passed
+        wished = kept.zoomed(found.distance / kept.distance, scale=found.distance) if kept is not found else found
+        if view.orbits.get(side) is found:
+            view.orbits[side] = wished
+        return kept
+
+    @property
+    def side(self) -> str:
+        """The scene that the step shows."""
+        return "source" if self.step == "Select" else "target"
+
+    def cameras(self) -> Cameras | None:
+        """The cameras of the scene that the step shows; None where they or the scene are not there yet."""
+        if self.session is None:
+            return None
+        files = self.session.files
+        scene, path = (
+            (files.source_scene, files.source_cameras)
+            if self.side == "source"
+            else (files.target_scene, files.target_cameras)
+        )
+        return self.session.scenes.cameras(path) if path.is_file() and scene.is_file() else None
+
+    def up(self) -> np.ndarray:
+        """Up direction of the scene that the step shows."""
+        session, cameras = self.require_session(), self.cameras()
+        if self._ups.get(self.side, (None, None))[0] is not cameras:
+            # kept here, because views must not wait for what a session computes
+            self._ups[self.side] = (cameras, session.up(self.side).double().numpy())
+        return self._ups[self.side][1]
+
+    def _free_space(self) -> FreeSpace | None:
+        session, cameras = self.session, self.cameras()
+        if session is None or cameras is None:
+            return None
+        scene, objects = session.scenes.gaussians(session.files.target_scene), session.objects()
+        known, space = self._space
+        if known is None or known[0] is not scene or known[1] is not objects:
+            foot = objects[0].target_from_object.points(session.placeable_object(0).base.point) if objects else None
+            space = FreeSpace.of(scene, cameras, session.up("target"), foot)
+            self._space = ((scene, objects), space)
+        return space
+
+    def _want_light(self) -> None:
+        session, pictures = self.session, self.pictures
+        if session is None or pictures is None or self._light is None or self.step == "Select" or not self.stream.views:
+            return
+        if not session.files.transfers_light or not session.files.target_scene.is_file():
+            return
+        state = self.shown_state()
+        if not state.objects:
+            return
+        stage = pictures.lit.stage(state)
+        if stage == "final" or (stage == "file" and self.step != "Light"):
+            return
+        self._light.want(state, final=self.live is None)
+
+    def _lit(self, state: EditState, lit: Lit) -> None:
+        if self.pictures is not None and self._is_open:
+            self.pictures.lit.add(state, lit)
+            self.stream.touch()
+            if self.live is None:
+                self.refresh()
+
+    def _light_failed(self, text: str) -> None:
+        self.say(text, bad=True)
+        self._send_panel()
+
+    def _drawing_failed(self, error: Exception) -> None:
+        traceback.print_exception(error)
+        self._failed(error)
+
+    def _failed(self, error: Exception) -> None:
+        self.say(str(error), bad=True)
+        self._send_panel()
+
+    # what windows send, in the thread of the server
+
+    def opened(self, window: Window) -> None:
+        """Draw for a new window."""
+        self.stream.add(View(window))
+        self._send_panel()
+        with contextlib.suppress(queue.Full):
+            self._actions.put_nowait((window, {"t": "opened"}))
+
+    def closed(self, window: Window) -> None:
+        """Draw for it no more; the next oldest edits."""
+        self.stream.remove(window)
+        self._send_panel()
+
+    def received(self, window: Window, message: dict[str, Any]) -> None:
+        """Take a message; views move at once, all else waits in line."""
+        view, kind = self.stream.of(window), message["t"]
+        if view is None:
+            return
+        if kind in ("size", "ack", "turn", "pan", "zoom", "split"):
+            getattr(self, f"_take_{kind}")(view, message)
+            return
+        if kind == "pointer":
+            Pointer.of(message)
+        elif not isinstance(message[_WORDS[kind]], str):
+            raise ValueError("expected a name")
+        if view is self.editing():
+            if kind == "pointer" and message["what"] == "move":
+                waits, self._moves = self._moves is not None, message
+                if waits:
+                    return
+            try:
+                self._actions.put_nowait((window, message))
+            except queue.Full as error:
+                raise ValueError("expected fewer messages") from error
+
+    def _take_size(self, view: View, message: dict[str, Any]) -> None:
+        width, height = int(message["w"]), int(message["h"])
+        if not (0 < width < 1 << 15 and 0 < height < 1 << 15):
+            raise ValueError("expected a size of a canvas")
+        view.size = (width, height)
+        self.stream.touch(view)
+
+    def _take_ack(self, view: View, message: dict[str, Any]) -> None:
+        self.stream.acknowledge(view, int(message["n"]))
+
+    def _take_turn(self, view: View, message: dict[str, Any]) -> None:
+        self._move_view(view, lambda orbit: orbit.turned(_share(message["x"]), _share(message["y"]), up=self.up()))
+
+    def _take_pan(self, view: View, message: dict[str, Any]) -> None:
+        self._move_view(view, lambda orbit: orbit.moved(_share(message["x"]), _share(message["y"])))
+
+    def _take_zoom(self, view: View, message: dict[str, Any]) -> None:
+        factor = 2 ** _share(message["by"])
+        self._move_view(view, lambda orbit: orbit.zoomed(factor, scale=self.scene_scale()))
+
+    def _take_split(self, view: View, message: dict[str, Any]) -> None:
+        view.split = min(1.0, max(0.0, _share(message["x"])))
+        self.stream.touch(view, moving=True)
+
+    def _move_view(self, view: View, move: Callable[[Orbit], Orbit]) -> None:
+        found = view.orbits.get(self.side)
+        if found is not None:
+            view.orbits[self.side], view.photo = move(found), None
+            self.stream.touch(view, moving=True)
+
+    def scene_scale(self) -> float:
+        """Typical distance of the scene that the step shows."""
+        cameras = self.cameras()
+        return 1.0 if cameras is None else typical_distance(cameras)
+
+    def to_photo(self, index: int) -> None:
+        """Move the editing window's view to one of the scene's cameras."""
+        cameras, view = self.cameras(), self.editing()
+        if cameras is not None and view is not None:
+            view.photo = index % len(cameras)
+            view.orbits[self.side] = through(cameras[view.photo], typical_distance(cameras))
+            self.stream.touch(view)
+
+    # actions of the window that edits, in a thread of their own
+
+    def _act(self) -> None:
+        while (action := self._actions.get()) is not None:
+            window, message = action
+            if message["t"] == "pointer" and message["what"] == "move":
+                message, self._moves = self._moves or message, None
+            with self.lock:
+                view = self.editing()
+                if view is not None and view.window is window:
+                    self._take_action(view, message)
+
+    def _take_action(self, view: View, message: dict[str, Any]) -> None:
+        is_move = message["t"] == "live" or (message["t"] == "pointer" and message["what"] == "move")
+        if self.is_bad and not is_move and message["t"] != "opened":
+            self.say("")  # an error holds until the next action
+        with self.reported():
+            getattr(self, f"_do_{message['t']}")(view, message)
+        if not is_move:
+            self.refresh()
+
+    def _do_opened(self, view: View, message: dict[str, Any]) -> None:
+        """What is only computed for a window follows: the light."""
+
+    def _do_do(self, view: View, message: dict[str, Any]) -> None:
+        if not self._form.offers(message["id"], message.get("value")):
+            return  # of a panel that has changed meanwhile
+        self._form.handle(message["id"], message.get("value"))
+
+    def _do_live(self, view: View, message: dict[str, Any]) -> None:
+        if not self._form.offers(message["id"], message.get("value")):
+            return
+        if message["id"] == "photo":
+            self.to_photo(int(message["value"]) - 1)
+        else:
+            self.panels[self.step].live(message["id"], message["value"])
+
+    def _do_pointer(self, view: View, message: dict[str, Any]) -> None:
+        self.panels[self.step].pointer(view, Pointer.of(message))
+
+    def _do_step(self, view: View, message: dict[str, Any]) -> None:
+        if message["to"] in STEPS:
+            self.show_step(message["to"])
+
+    def _do_key(self, view: View, message: dict[str, Any]) -> None:
+        key, session = message["key"], self.session
+        common: dict[str, Callable[[], object]] = {
+            "ctrl+z": lambda: self._undo(self.require_session().undo(), "undone", "nothing to undo"),
+            "ctrl+shift+z": lambda: self._undo(self.require_session().redo(), "redone", "nothing to redo"),
+            "f": lambda: self._look_at_object(view),
+            "home": lambda: self.to_photo(0),
+        }
+        if key in common:
+            common[key]()
+        elif (
+            not self.panels[self.step].key(view, str(key))
+            and session is not None
+            and key in ("arrowleft", "arrowright")
+        ):
+            self.to_photo((view.photo or 0) + (1 if key == "arrowright" else -1))
+
+    def _undo(self, is_done: bool, done: str, nothing: str) -> None:
+        self.live = None
+        self.say(done if is_done else nothing)
+
+    def show_step(self, step: str) -> None:
+        """Switch to another step."""
+        self.panels[self.step].leave()
+        self.live, self.step = None, step
+        self.say("")
+        for view in self.stream.views:
+            view.photo = None if self.side == "target" else 0
+            if self.side == "source":
+                view.orbits.pop("source", None)  # Select begins at a photo
+        with self.reported():
+            self.panels[step].enter()
+        self.refresh()
+
+    def _look_at_object(self, view: View) -> None:
+        scene, orbit = self._object_in_view(), view.orbits.get(self.side)
+        if scene is None or not scene.count or orbit is None:
+            raise ValueError("There is no object to look at yet.")
+        view.orbits[self.side], view.photo = orbit.framing(bounding_sphere(scene), up=self.up()), None
+        self.stream.touch(view)
+
+    def _object_in_view(self) -> Gaussians | None:
+        session = self.require_session()
+        if self.step == "Select":
+            which = session.selection()
+            return None if which is None else session.scenes.gaussians(session.files.source_scene).select(which)
+        pairs = enumerate(session.objects())
+        parts = [one.target_from_object.gaussians(session.placeable_object(i).gaussians) for i, one in pairs]
+        return concatenate(parts) if parts else None
+
+    @contextlib.contextmanager
+    def reported(self) -> Iterator[None]:
+        """Show an error of the block in the status line instead of raising it."""
+        try:
+            yield
+        except (ValueError, OSError) as error:
+            self.is_unsaved = self.is_unsaved or disk_full(error)
+            line = os_error_line(error) if isinstance(error, OSError) else str(error)
+            self.say(_FULL_DISK if disk_full(error) else line, bad=True)
+        except Exception as error:  # a programming error must be visible and must not end the page
+            traceback.print_exc()
+            self.say(f"{type(error).__name__}: {error} (traceback in the terminal)", bad=True)
+
+    # files
+
+    def file(self, name: str) -> Path | None:
+        """The file that is served for a name."""
+        return None if self.session is None else served_file(self.session.files, name)
+
+    def upload_path(self, name: str) -> Path:
+        """Where an uploaded file goes, below a folder of its own if its name begins with one."""
+        folder, _, given = name.replace("\\", "/").rpartition("/")
+        path = Path(given)
+        if not path.suffix or path.name.startswith(".") or "\x00" in given or len(given) > 200:
+            raise ValueError(f"{given:.60}: expected a file with a suffix that names its format, found none")
+        if folder and not re.fullmatch(r"photos_[0-9]{1,13}", folder):
+            folder = ""
+        place = self.project.file.parent / _UPLOADS_FOLDER / folder
+        place.mkdir(parents=True, exist_ok=True)
+        number, found = 1, place / path.name
+        while found.exists():
+            number += 1
+            found = place / f"{path.stem}_{number}{path.suffix}"
+        return found
+
+    def uploaded(self, path: Path, use: str) -> None:
+        """Use an uploaded file; twice the same file is one."""
+        twins = [
+            one
+            for one in sorted(path.parent.glob(f"{re.sub(r'_[0-9]+$', '', path.stem)}*{path.suffix}"))
+            if one != path
+        ]
+        twin = next(
+            (
+                one
+                for one in twins
+                if one.stat().st_size == path.stat().st_size and one.read_bytes() == path.read_bytes()
+            ),
+            None,
+        )
+        if twin is not None:
+            path.unlink()
+        with self.lock:
+            with self.reported():
+                self.say(f"{path.name}: stored as {twin or path}")
+                self.panels[self.step].uploaded(twin or path, use)
+            self.refresh()
+
+    # files and jobs that change
+
+    def _poll_loop(self) -> None:
+        while self._is_open:
+            time.sleep(_POLL_SECONDS)
+            with self.lock:
+                if self._is_open:
+                    self.poll()
+
+    def poll(self) -> None:
+        """Load what was changed outside the editor, save what could not be, and show how far the job is."""
+        session = self.session
+        with self.reported():
+            if self.problem is not None and stamps_of(self.project.file) != self._seen:
+                self.open_project()
+            elif session is not None and session.reload():
+                if self.pictures is not None:
+                    self.pictures.lit.forget()
+                self.say("the project's files were changed outside the editor and were loaded again")
+                self.refresh()
+            elif session is not None and (session.unsaved or self.is_unsaved) and session.save_again():
+                self.is_unsaved = False
+                self.say("saved again")
+                self.refresh()
+            state = None if session is None else session.jobs.state()
+            if state is not None:
+                self._show_job(state)
+
+    def _show_job(self, state: JobState) -> None:
+        current = f"{state.pid} {state.outcome} {state.step}"
+        if current == self._last_job:
+            if state.live:
+                self._send_panel()
+            return
+        ended, self._last_job = bool(self._last_job) and not state.live, current
+        if ended or state.outcome == "killed":
+            sentences = {
+                "done": "done",
+                "failed": state.error,
+                "cancelled": "cancelled; finished steps are kept, and the same run resumes from here",
+                "killed": "the process ended unexpectedly; start it again, it resumes from where it was",
+            }
+            self.say(f"{state.title}: {sentences.get(state.outcome, '')}", bad=state.outcome in ("failed", "killed"))
+        if ended:
+            for panel in self.panels.values():
+                panel.job_ended(state)
+        self.refresh()
+
+    def _job(self) -> dict[str, Any] | None:
+        """The running job, as the page shows it."""
+        state = None if self.session is None else self.session.jobs.state()
+        if state is None or not state.live:
+            return None
+        now = time.time()
+        whole, left = seconds_left_in_job(state, now), seconds_left(state, now)
+        parts = [f"about {_minutes(left)} left in this step"] if left is not None else []
+        parts += [f"about {_minutes(whole)} in all"] if whole is not None else []
+        names = [step.name for step in state.plan]
+        at = names.index(state.step) if state.step in names else -1
+        return {
+            "title": state.title,
+            "left": ", ".join(parts) or "time left: not measured yet",
+            "steps": [["✓" if i < at else "●" if i == at else "·", name] for i, name in enumerate(names)]
+            if at >= 0
+            else [["●", state.step or "starting"]],
+            "message": state.message,
+            "share": state.fraction,
+        }
+
+    def cancel_job(self) -> None:
+        """Interrupt the running job."""
+        self.require_session().jobs.cancel()
+        self.say("stopping")
+
+    def _find_marks(self, session: Session | None) -> None:
+        """Find which steps are done, out of date, or next, once nothing has changed for a moment."""
+        if self._marker.wait_idle(_MARK_SECONDS):
+            marks = {} if session is None else _marks(session)
+            with self.lock:
+                if session is self.session and marks != self._marks:
+                    self._marks = marks
+                    self._send_panel()
+
+
+def _marks(session: Session) -> dict[str, str]:
+    """The marks of the steps that are done, out of date, or next."""
+    files, reasons = session.files, session.project.reasons()
+
+    def state(exists: bool, *steps: str) -> str | None:
+        return None if not exists else _DONE if all(reasons.get(step) is None for step in steps) else _STALE
+
+    have_both = files.source_scene.is_file() and files.target_scene.is_file()
+    exports = written_exports(files)
+    result = max((p.stat().st_mtime_ns for p in (files.result, files.relit) if p.is_file()), default=0)
+    states = {
+        "Open": state(have_both, "source/reconstruct", "target/reconstruct"),
+        "Select": state(files.object.is_file(), "segment"),
+        "Place": _DONE if session.objects() else None,
+        "Light": _DONE if session.state.light is not None or files.relit.is_file() else None,
+        "Run": state(files.result.is_file(), "consolidate"),
+        "Share": None if not exports else _DONE if exports[0].stat().st_mtime_ns >= result else _STALE,
+    }
+    # a light is found without being set
+    following = next((name for name, mark in states.items() if mark is None and name != "Light"), None)
+    return {name: mark or _NEXT for name, mark in states.items() if mark is not None or name == following}
+
+
+def _share(value: Any) -> float:
+    """A drag or a place over a canvas's side."""
+    number = float(value)
+    if isinstance(value, bool) or not -10 < number < 10:
+        raise ValueError("expected a place near the canvas")
+    return number
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"

@@ -1,0 +1,165 @@
+"""The panel as a value: a step describes its controls anew after every change, and the page draws what differs.
+
+A control's handler is called with what a browser sent only if the control offers that value.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+Handler = Callable[[Any], object]
+_MAX_TEXT = 4096  # characters; paths are shorter on all systems
+
+
+class Form:
+    """Controls in their order, and their handlers."""
+
+    def __init__(self) -> None:
+        """Start without controls."""
+        self.controls: list[dict[str, Any]] = []
+        """What the page draws; the kinds are those of `editor.js`."""
+        self._handlers: dict[str, tuple[Callable[[Any], Any], Handler]] = {}
+        self._is_more = False
+
+    def more(self) -> None:
+        """Put the controls that follow under `More`."""
+        self._is_more = True
+
+    def note(self, text: str, *, name: str = "note", bad: bool = False, faint: bool = False) -> None:
+        """A paragraph; nothing where the text is empty."""
+        if text:
+            self._add("note", name, text=text, bad=bad, faint=faint)
+
+    def button(
+        self, name: str, label: str, work: Callable[[], object], *, main: bool = False, disabled: bool = False
+    ) -> None:
+        """A button; `main` marks the one that continues the step."""
+        self._add("button", name, label=label, main=main, disabled=disabled)
+        if not disabled:
+            self._handlers[name] = (lambda value: None, lambda _: work())
+
+    def buttons(self, name: str, choices: Mapping[str, Callable[[], object]]) -> None:
+        """Several buttons in a row."""
+        self._add("buttons", name, options=list(choices))
+        self._handlers[name] = (_one_of(list(choices)), lambda value: choices[value]())
+
+    def check(self, name: str, label: str, value: bool, work: Handler, *, hint: str = "") -> None:
+        """A checkbox."""
+        self._add("check", name, label=label, value=value, hint=hint)
+        self._handlers[name] = (_one_of([False, True]), work)
+
+    def choice(
+        self, name: str, label: str, value: str, options: Sequence[str], work: Handler, *, hint: str = ""
+    ) -> None:
+        """One of several."""
+        self._add("choice", name, label=label, value=value, options=list(options), hint=hint)
+        self._handlers[name] = (_one_of(options), work)
+
+    def slider(
+        self, name: str, label: str, value: float, ends: tuple[float, float, float], work: Handler, *, hint: str = ""
+    ) -> None:
+        """A number between two ends, which are given with the step."""
+        low, high, step = ends
+        self._add("slider", name, label=label, value=value, min=low, max=high, step=step, hint=hint)
+
+        def checked(value: Any) -> Any:
+            if not low <= _number(value) <= high:
+                raise ValueError("expected a number on the slider")
+            return value
+
+        self._handlers[name] = (checked, work)
+
+    def numbers(
+        self, name: str, label: str, values: Sequence[float], work: Handler, *, step: float = 0.001, hint: str = ""
+    ) -> None:
+        """Fields for one or several numbers; the handler gets a tuple, and refuses what cannot be."""
+        self._add("numbers", name, label=label, value=list(values), step=step, hint=hint)
+
+        def checked(given: Any) -> tuple[float, ...]:
+            if not isinstance(given, list) or len(given) != len(values):
+                raise ValueError("expected as many numbers as there are fields")
+            return tuple(_number(value) for value in given)
+
+        self._handlers[name] = (checked, work)
+
+    def text(self, name: str, label: str, value: str, work: Handler, *, hint: str = "", browse: bool = False) -> None:
+        """A line of text; `browse` adds a button that opens the folders of this machine."""
+        self._add("text", name, label=label, value=value, hint=hint, browse=browse)
+        self._handlers[name] = (_text, work)
+
+    def hidden(self, name: str, work: Callable[[], object]) -> None:
+        """A handler of a part of another control, such as its button `browse`."""
+        self._handlers[name] = (lambda value: None, lambda _: work())
+
+    def rows(self, name: str, rows: Sequence[str], work: Handler) -> None:
+        """Lines of which one is clicked."""
+        self._add("rows", name, options=list(rows))
+        self._handlers[name] = (_one_of(rows), work)
+
+    def upload(self, name: str, label: str, suffixes: Sequence[str], *, many: bool = False) -> None:
+        """A button and a place to drop files on; the server gets them by another request."""
+        self._add("upload", name, label=label, accept=",".join(suffixes), many=many)
+
+    def drawing(self, name: str, svg: str, work: Handler) -> None:
+        """An SVG whose dots are dragged; the handler gets the dot's number, x, y and whether the drag has ended."""
+        self._add("drawing", name, svg=svg)
+
+        def checked(given: Any) -> tuple[int, float, float, bool]:
+            index, x, y, is_end = given
+            if not (isinstance(index, int) and isinstance(is_end, bool) and math.hypot(_number(x), _number(y)) < 2):
+                raise ValueError("expected a place in the drawing")
+            return index, float(x), float(y), is_end
+
+        self._handlers[name] = (checked, work)
+
+    def progress(self, name: str, share: float) -> None:
+        """A bar, filled to a share in [0, 1]."""
+        self._add("progress", name, value=round(share, 3))
+
+    def links(self, name: str, links: Sequence[tuple[str, str, str | None, str]]) -> None:
+        """Files: name, remark, address that opens it or None, address that downloads it or an empty text."""
+        if links:
+            self._add("links", name, options=[list(link) for link in links])
+
+    def handle(self, name: str, value: Any) -> None:
+        """Call the handler of a control with a value that a browser sent.
+
+        Raises:
+            KeyError: If there is no such control.
+            ValueError: If it does not offer that value, or its handler refuses it.
+        """
+        check, work = self._handlers[name]
+        work(check(value))
+
+    def offers(self, name: str, value: Any) -> bool:
+        """Whether there is such a control, and it offers that value."""
+        try:
+            self._handlers[name][0](value)
+        except (ValueError, TypeError, KeyError):
+            return False
+        return True
+
+    def _add(self, kind: str, name: str, **properties: Any) -> None:
+        given = {key: value for key, value in properties.items() if value is not False and value != ""}
+        self.controls.append({"kind": kind, "id": name, **given, **({"more": True} if self._is_more else {})})
+
+
+def _one_of(options: Sequence[Any]) -> Callable[[Any], Any]:
+    def checked(value: Any) -> Any:
+        if not any(type(value) is type(option) and value == option for option in options):
+            raise ValueError("expected one of the options")
+        return value
+
+    return checked
+
+
+def _number(value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError("expected a number")
+    return float(value)
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > _MAX_TEXT or "\x00" in value:
+        raise ValueError("expected a line of text")
+    return value

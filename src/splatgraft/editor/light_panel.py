@@ -1,0 +1,330 @@
+"""The step `Light`: lights dragged on a picture of the sky or in the view, a sun by two clicks, and strengths."""
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.editor.drag import Corner, on_canvas
+from splatgraft.editor.form import Form
+from splatgraft.editor.panel import Panel, Pointer, view_camera
+from splatgraft.editor.picking import first_surface_hit
+from splatgraft.editor.session import Session
+from splatgraft.editor.sky_dome import SkyDome
+from splatgraft.editor.state import check_state
+from splatgraft.editor.stream import View
+from splatgraft.relighting import Light, LightSource
+from splatgraft.relighting.captured_scene import CapturedScene
+from splatgraft.relighting.light.sun import Point, direction_through, set_sun, with_sun
+
+if TYPE_CHECKING:
+    from splatgraft.editor.editor import Editor
+
+_FIRST = (
+    ("exposure", "Brightness", (-2.0, 2.0), "Of the object, in stops; 0 is as computed"),
+    ("warmth", "Warmth", (-2.0, 2.0), "Of the object's colours; 0 is as computed"),
+    ("shadow", "Shadow strength", (0.0, 2.0), "1 is as computed"),
+)
+_LAYERS = (
+    ("shade", "Light and dark sides", (0.0, 2.0), "Of the object; 1 is as computed"),
+    ("tint", "Colour of the light", (0.0, 4.0), "Change of the object's colour by the new light; 1 is as computed"),
+    ("bounce", "Light onto the place", (0.0, 2.0), "That the object reflects onto its surroundings; 1 is as computed"),
+    ("gloss", "Reflections", (0.0, 2.0), "On the object; 1 is as computed"),
+)
+"""Field of `LayerWeights`, label, ends of the slider and hint."""
+_WEIGHTS = {name for name, _, _, _ in (*_FIRST, *_LAYERS)}
+_SOFTNESS = (0.3, 30.0)  # degrees; the sun's own is .27
+_MAX_SOURCES = 4
+_UNSEEN = 0.5  # share of the directions overhead that were not photographed, from which on the panel says so
+_MARK = "#ffc83c"
+
+
+class LightPanel(Panel):
+    """Its controls, and the lights in the view."""
+
+    def __init__(self, editor: "Editor") -> None:
+        """Take no clicks for the sun yet."""
+        super().__init__(editor)
+        self._chosen, self._sets_sun = 0, False
+        self._points: tuple[Point, ...] = ()
+        self._set_light: Light | None = None
+        """The light when the last point was added; under another one, as after undo, pairs begin anew."""
+        self._full: tuple[tuple[float, float, float], ...] = ()
+        """Irradiance of each source at a strength of 1: what it was before the slider changed it."""
+        self._scaled: tuple[LightSource, ...] | None = None
+        """The sources that the slider made last."""
+        self._dome: SkyDome | None = None
+        """How the picture of the sky is turned."""
+        self._handle: tuple[int, Corner] | None = None
+
+    def enter(self) -> None:
+        """Show the light, which follows the edits."""
+        if self.editor.kind == "Result":
+            self.editor.kind = "With its new light"
+
+    def leave(self) -> None:
+        """Take no more clicks."""
+        self._sets_sun, self._handle = False, None
+
+    def build(self, form: Form) -> None:
+        """Describe the light, and how strong its parts are."""
+        session = self.editor.require_session()
+        light = self._light(session)
+        if light is None:
+            form.note(self._missing(session), name="light")
+        else:
+            form.check(
+                "sun",
+                "Set the sun by two clicks",
+                self._sets_sun,
+                self._toggle_sun,
+                hint="On what casts a shadow, then on the same point of its shadow",
+            )
+            self._build_sky(form, session, light)
+        for name, label, ends, hint in _FIRST:
+            self._weight(form, name, label, (*ends, 0.05), hint)
+        if light is not None and light.sources:
+            softness = light.sources[self._chosen].angular_radius_deg
+            form.slider(
+                "softness", "Shadow softness", round(min(_SOFTNESS[1], max(_SOFTNESS[0], softness)), 1),
+                (*_SOFTNESS, 0.1),
+                lambda v: self._change(lambda s: replace(s, angular_radius_deg=float(v), uncertainty_deg=0.0)),
+                hint="Degrees that the chosen light seems wide",
+            )  # fmt: skip
+        form.button(
+            "estimate",
+            "Back to the estimate",
+            lambda: session.change(replace(session.state, light=None)),
+            disabled=session.state.light is None,
+        )
+        form.more()
+        if light is not None and light.sources:
+            self._build_sources(form, light)
+        for name, label, ends, hint in _LAYERS:
+            self._weight(form, name, label, (*ends, 0.05), hint)
+
+    def _build_sky(self, form: Form, session: Session, light: Light) -> None:
+        view = self.editor.editing()
+        orbit = None if view is None else self.editor.orbit(view)
+        ahead = torch.tensor([0.0, 1.0, 0.0]) if orbit is None else torch.tensor(orbit.forward).float()
+        dome = self._dome = SkyDome.seen_along(ahead, session.up())
+        form.drawing("sky", dome.svg(light), self._drag_on_sky)
+        named = [f"{s.name.partition(' set by hand')[0]} {dome.words(s)}" for s in light.sources[:_MAX_SOURCES]]
+        by = "Estimated" if session.state.light is None else "Set by hand"
+        found = "; ".join(named) if named else "even light without a clear source"
+        doubt = " Nobody photographed the ceiling: light from above is a guess." if light.unseen_up > _UNSEEN else ""
+        form.note(f"{by}: {found}.{doubt}", name="light")
+
+    def _build_sources(self, form: Form, light: Light) -> None:
+        names = [f"{i + 1}: {s.name}" for i, s in enumerate(light.sources)]
+        self._chosen = min(self._chosen, len(names) - 1)
+        form.choice("source", "Light", names[self._chosen], names, lambda v: setattr(self, "_chosen", names.index(v)))
+        if light.sources != self._scaled:
+            self._full, self._scaled = tuple(source.irradiance for source in light.sources), light.sources
+        now, full = max(light.sources[self._chosen].irradiance), max(self._full[self._chosen])
+        strength = min(3.0, round(now / full, 2)) if full > 0 else 1.0
+        form.slider("strength", "Strength", strength, (0.0, 3.0, 0.05), self._scale)
+
+    def _weight(self, form: Form, name: str, label: str, ends: tuple[float, float, float], hint: str) -> None:
+        """The slider of one of the layers' weights."""
+        weight = getattr(self.editor.require_session().state.weights, name)
+        form.slider(name, label, weight, ends, lambda value: self._set_weight(name, value), hint=hint)
+
+    def _light(self, session: Session) -> Light | None:
+        """The light of a drag, that set by hand, or the last estimate."""
+        state = self.editor.live or session.placed_state()
+        if not session.objects() or not session.files.transfers_light:
+            return None
+        if state.light is not None:
+            self._chosen = min(self._chosen, max(0, len(state.light.sources) - 1))
+            return state.light
+        relit = None if self.editor.pictures is None else self.editor.pictures.lit.relit(state)
+        found = None if relit is None else relit.light
+        self._chosen = min(self._chosen, max(0, len(found.sources) - 1)) if found is not None else 0
+        return found
+
+    def _missing(self, session: Session) -> str:
+        """Why there is no light to show."""
+        if not session.files.transfers_light:
+            return "The light transfer is off in project.toml: the object is shown as it was captured."
+        if not session.objects():
+            return "No object is placed yet: see Place."
+        relit = None if self.editor.pictures is None else self.editor.pictures.lit.relit(session.placed_state())
+        return "Estimating the light." if relit is None else " ".join(one.text for one in relit.report)
+
+    # strengths
+
+    def live(self, name: str, value: Any) -> None:
+        """Show a strength while its slider is dragged."""
+        if name == "sky":
+            self._drag_on_sky(value)
+        elif name in _WEIGHTS:
+            state = self.editor.require_session().placed_state()
+            self.editor.show_live(replace(state, weights=replace(state.weights, **{name: float(value)})))
+
+    def _set_weight(self, name: str, value: float) -> None:
+        session = self.editor.require_session()
+        self.editor.live = None
+        session.change(replace(session.state, weights=replace(session.state.weights, **{name: float(value)})))
+
+    def _scale(self, value: float) -> None:
+        r, g, b = (float(value) * part for part in self._full[self._chosen])
+        self._change(lambda source: replace(source, irradiance=(r, g, b)), keeps_strength=True)
+
+    def _change(self, change: Any, *, keeps_strength: bool = True) -> None:
+        """Change the chosen source; the strengths stay relative to what they were."""
+        session = self.editor.require_session()
+        light = self._light(session)
+        if light is not None and light.sources:
+            edited = with_source(light, self._chosen, change(light.sources[self._chosen]))
+            if keeps_strength:
+                self._scaled = edited.sources
+            session.change(replace(session.placed_state(), light=edited))
+
+    # directions
+
+    def _drag_on_sky(self, given: tuple[int, float, float, bool]) -> None:
+        """Move a light on the picture of the sky, to x and y over the horizon's radius."""
+        index, x, y, is_end = given
+        session, dome = self.editor.require_session(), self._dome
+        light = self._light(session)
+        if dome is None or light is None or not 0 <= index < len(light.sources):
+            raise ValueError("There is no such light.")
+        self._chosen = index
+        self._move(with_direction(light, index, dome.direction(x, y)), ended=is_end)
+
+    def _move(self, light: Light, *, ended: bool) -> None:
+        """Show a light whose source is being dragged, and save it at the end, as one undo step."""
+        session = self.editor.require_session()
+        edited = replace(session.placed_state(), light=light)
+        check_state(edited)
+        if ended:
+            self.editor.live = None
+            session.change(edited)
+        else:
+            self.editor.show_live(edited)
+
+    def overlay(self, view: View, camera: Cameras) -> dict[str, Any]:
+        """Arrows of the lights, and the points that set the sun."""
+        session = self.editor.require_session()
+        light = self._light(session)
+        if light is None or self.editor.kind != "With its new light":
+            return {}
+        centre, length = self._centre_and_length(session)
+        lines, dots = [], []
+        for index, source in enumerate(light.sources[:_MAX_SOURCES]):
+            peak = max(*source.irradiance, 1e-9)
+            r, g, b = (round(255 * max(0.0, value / peak) ** (1 / 2.2)) for value in source.irradiance)
+            tail, head = on_canvas(arrow_points(source, centre, length), camera)
+            if tail is not None and head is not None:
+                width = 6 if index == self._chosen else 3
+                lines.append({"points": [tail, head], "color": f"rgb({r},{g},{b})", "width": width, "arrow": True})
+                dots.append({"at": tail, "color": f"rgb({r},{g},{b})", "id": f"light:{index}"})
+        if self._sets_sun:
+            at = on_canvas(torch.tensor(self._kept()).reshape(-1, 3), camera)
+            dots += [{"at": point, "color": _MARK} for point in at if point is not None]
+            lines += [{"points": [a, b], "color": _MARK} for a, b in zip(at[::2], at[1::2], strict=False) if a and b]
+        return {"lines": lines, "dots": dots}
+
+    def _centre_and_length(self, session: Session) -> tuple[Float[Tensor, "3"], float]:
+        """Where the arrows point, and how far away they begin."""
+        base, placed = session.placeable_object(0).base, session.objects()[0].target_from_object
+        length = 3.0 * placed.scale * max(base.height, base.radius)
+        return placed.points(base.point + 0.5 * base.height * base.up), length
+
+    def pointer(self, view: View, pointer: Pointer) -> None:
+        """Drag an arrow's tail, or set the sun."""
+        session = self.editor.require_session()
+        if pointer.on.startswith("light:") and pointer.what == "down":
+            index, light = int(pointer.on.removeprefix("light:")), self._light(session)
+            if light is not None and 0 <= index < len(light.sources):
+                self._chosen = index
+                tail = arrow_points(light.sources[index], *self._centre_and_length(session))[0]
+                self._handle = (index, Corner(tail, view_camera(self.editor, view)))
+        elif self._handle is not None and pointer.what in ("move", "up", "cancel"):
+            (index, corner), light = self._handle, self._light(session)
+            if pointer.what != "move":
+                self._handle = None
+            if pointer.what == "cancel" or light is None:
+                self.editor.show_live(None)
+            else:
+                towards = corner.at(pointer.place) - self._centre_and_length(session)[0]
+                self._move(with_direction(light, index, towards), ended=pointer.what == "up")
+        elif pointer.what == "click" and self._sets_sun:
+            self._add_point(view, pointer)
+
+    def key(self, view: View, key: str) -> bool:
+        """Escape ends the clicks for the sun."""
+        if key == "escape":
+            self._sets_sun = False
+        return key == "escape"
+
+    # the sun by two clicks
+
+    def _kept(self) -> tuple[Point, ...]:
+        """The points that still hold."""
+        return self._points if self.editor.require_session().state.light is self._set_light else ()
+
+    def _toggle_sun(self, value: bool) -> None:
+        self._sets_sun = value
+        if value:
+            self.editor.say("click what casts a shadow in the scene, such as the corner of a table")
+
+    def _add_point(self, view: View, pointer: Pointer) -> None:
+        session, ray = self.editor.require_session(), pointer.ray(view_camera(self.editor, view))
+        state, files = session.placed_state(), session.files
+        scene = session.scenes.gaussians(files.target_scene)
+        if state.erased is not None:
+            scene = scene.select(~state.erased)
+        hit = first_surface_hit(scene, ray.origin, ray.direction)
+        if hit is None:
+            raise ValueError("Click on a surface: there is none under the pointer.")
+        x, y, z = hit.tolist()
+        points = (*self._kept(), (x, y, z))
+        if len(points) % 2:
+            self._points, self._set_light = points, session.state.light
+            self.editor.say("now click the same point of its shadow")
+            return
+        self._points, light = points[:-2], self._light(session)
+        if light is None:
+            raise ValueError(self._missing(session))
+        captured = CapturedScene(scene, session.scenes.cameras(files.target_cameras), session.scenes.target_clock())
+        sun = set_sun(points, captured)
+        session.change(replace(state, light=with_sun(light, sun)))
+        self._points, self._set_light = points, session.state.light
+        pairs = "one pair of points" if len(points) == 2 else f"{len(points) // 2} pairs of points"
+        if sun.ratio is None:
+            self.editor.say(
+                f"the sun by {pairs}; no edge of a shadow is seen there, so its strength is estimated; "
+                "click another pair beside a clear shadow"
+            )
+            return
+        moved_deg = math.degrees(math.acos(min(1.0, float(sun.direction @ direction_through(points, captured.up)[0]))))
+        moved = f", moved {moved_deg:.0f}° to fit the shadows there" if moved_deg > 1 else ""
+        self.editor.say(f"the sun by {pairs}{moved}; its strength is as the shadow's edge shows")
+
+
+def arrow_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "2 3"]:
+    """Tail and head of the arrow of a source: from `length` away towards `centre`, ending at 0.3 `length`."""
+    direction = torch.tensor(source.direction)
+    return torch.stack([centre + length * direction, centre + 0.3 * length * direction])
+
+
+def with_direction(light: Light, index: int, towards: Float[Tensor, "3"]) -> Light:
+    """The light with one source's direction set by hand, hence without uncertainty and without measured blockers."""
+    length = float(towards.norm())
+    if length < 1e-9:
+        return light
+    x, y, z = (towards / length).tolist()
+    moved = {"direction": (x, y, z), "uncertainty_deg": 0.0, "confidence": 1.0, "blockers_within": math.inf}
+    source = replace(light.sources[index], **moved)
+    return with_source(light, index, source)
+
+
+def with_source(light: Light, index: int, source: LightSource) -> Light:
+    """The light with another source in place of one."""
+    return replace(light, sources=(*light.sources[:index], source, *light.sources[index + 1 :]))

@@ -1,0 +1,203 @@
+"""The light of the edited scene, computed in a process of its own, so that no picture waits for it.
+
+The editor sends states. Back come the layers of the light transfer: a draft first, then, if it is wanted, those of the
+step `relight`.
+"""
+
+import contextlib
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO, Any, Literal
+
+from splatgraft.editor.project import Project
+from splatgraft.editor.relit_preview import RelitPreview
+from splatgraft.editor.scene_cache import SceneCache
+from splatgraft.editor.state import EditState
+from splatgraft.editor.worker import LatestOnlyWorker
+from splatgraft.relighting import Relit
+
+Stage = Literal["draft", "refined", "final"]
+_START = "import sys; from splatgraft.editor import light_process; light_process.main(sys.argv[1:])"
+"""What the process runs; a module that is run by its name would answer with classes that the editor does not know."""
+_FIELDS = ("objects", "erased", "light")
+"""What the light depends on in an `EditState`."""
+_SETTLE_SECONDS = 0.2  # how long nothing must change before the light itself is begun, which cannot be interrupted
+_REMEMBERED = 500  # states that were asked for; in a drag each picture asks for one, and a draft may take long
+_NICE = 5  # priority below that of pictures
+
+
+@dataclass(frozen=True)
+class Lit:
+    """Layers of the light transfer for one state."""
+
+    stage: Stage
+    """A draft, all layers under the sources found before a move, or the step's own result."""
+    relit: Relit
+    """The layers."""
+    seconds: float
+    """How long they took."""
+
+
+class LightProcess:
+    """The editor's side: it asks for the light of the newest state, and hears of each result."""
+
+    def __init__(
+        self, project: Project, on_lit: Callable[[EditState, Lit], None], on_error: Callable[[str], None]
+    ) -> None:
+        """Start no process yet."""
+        self._project, self._on_lit, self._on_error = project, on_lit, on_error
+        self._child: subprocess.Popen[bytes] | None = None
+        self._sent: dict[str, Any] = {}
+        self._asked: dict[int, EditState] = {}
+        self._number, self._wanted = 0, ""
+        self._lock = threading.Lock()
+
+    def want(self, state: EditState, *, final: bool) -> None:
+        """Ask for the light of a state, in place of what was asked before; nothing where it was asked for already."""
+        with self._lock:
+            latest = self._asked.get(self._number)
+            is_same = latest is not None and all(getattr(latest, name) is getattr(state, name) for name in _FIELDS)
+            if is_same and (self._wanted == "final" or not final):
+                return
+            if self._child is None or self._child.poll() is not None:
+                self._start()
+            assert self._child is not None
+            assert self._child.stdin is not None
+            # tensors that are sent once are the same objects on the other side, whose memos then hold
+            changed = {
+                name: getattr(state, name) for name in _FIELDS if self._sent.get(name, self) is not getattr(state, name)
+            }
+            self._number, self._wanted = self._number + 1, "final" if final else "draft"
+            self._asked = {
+                number: asked for number, asked in self._asked.items() if number > self._number - _REMEMBERED
+            }
+            self._asked[self._number] = state
+            try:
+                _write(self._child.stdin, (self._number, changed, final))
+                self._sent |= changed
+            except OSError:
+                self._child.kill()
+
+    def close(self) -> None:
+        """End the process."""
+        with self._lock:
+            child, self._child = self._child, None
+        if child is not None:
+            with contextlib.suppress(OSError):
+                assert child.stdin is not None
+                child.stdin.close()
+            child.kill()
+            child.wait()
+
+    def _start(self) -> None:
+        self._sent, self._asked = {}, {}
+        out = "" if self._project.out is None else str(self._project.out)
+        words = [sys.executable, "-c", _START, str(self._project.file), out]
+        self._child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+        threading.Thread(target=self._listen, args=(self._child,), name="splatgraft light", daemon=True).start()
+
+    def _listen(self, child: subprocess.Popen[bytes]) -> None:
+        assert child.stdout is not None
+        with child.stdout:
+            while (answer := _read(child.stdout)) is not None:
+                number, result = answer
+                with self._lock:
+                    state, is_current = self._asked.get(number), child is self._child
+                if not is_current or state is None:
+                    continue
+                if isinstance(result, str):
+                    self._on_error(result)
+                else:
+                    self._on_lit(state, result)
+        with self._lock:
+            if child is self._child:
+                # what it was asked last is asked again
+                self._asked, self._wanted = {}, ""
+
+
+class _Computing:
+    """The other side: two threads, so that a draft does not wait for the light of an earlier state."""
+
+    def __init__(self, project: Project, out: IO[bytes]) -> None:
+        files = project.files()
+        assert files is not None
+        self._project, self._out = project, out
+        self._lock = threading.Lock()
+        self._scenes = SceneCache(files)
+        self._relighting = RelitPreview(self._scenes)
+        self._drafts = LatestOnlyWorker(self._draft, self._failed)
+        self._lights = LatestOnlyWorker(self._light, self._failed)
+        self._number, self._state = 0, EditState()
+
+    def take(self, number: int, changed: dict[str, Any], final: bool) -> None:
+        files = self._project.files()
+        if files is not None:
+            self._scenes.files = files
+        self._number, self._state = number, replace(self._state, **changed)
+        self._drafts.submit((number, self._state, final))
+
+    def _draft(self, asked: tuple[int, EditState, bool]) -> None:
+        number, state, final = asked
+        start = time.monotonic()
+        if self._scenes.files.transfers_light and not self._relighting.is_relit(state):
+            self._send(number, "draft", self._relighting.draft(state), start)
+        if final:
+            self._lights.submit(asked)
+
+    def _light(self, asked: tuple[int, EditState, bool]) -> None:
+        number, state, _ = asked
+        if not self._lights.wait_idle(_SETTLE_SECONDS) or number != self._number:
+            return
+        start = time.monotonic()
+        if self._relighting.refine(state):
+            self._send(number, "refined", self._relighting.layers(state, draft=True), start)
+            if number != self._number:
+                return
+        self._send(number, "final", self._relighting.relit(state), start)
+        if self._lights.wait_idle(_SETTLE_SECONDS) and number == self._number:
+            self._relighting.prepare_drafts(state)
+
+    def _send(self, number: int, stage: Stage, relit: Relit, start: float) -> None:
+        # what only the step writes stays here
+        shown = replace(relit, estimate=None, received=(), prepared=())
+        with self._lock:
+            _write(self._out, (number, Lit(stage, shown, time.monotonic() - start)))
+
+    def _failed(self, error: Exception) -> None:
+        with self._lock:
+            _write(self._out, (self._number, " ".join(str(error).split()) or type(error).__name__))
+
+
+def main(arguments: list[str]) -> None:
+    """Answer until the input ends."""
+    # what is printed must not mix with the answers
+    answers, sys.stdout = os.fdopen(os.dup(1), "wb"), sys.stderr
+    os.dup2(2, 1)
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+    project = Project(Path(arguments[0]), Path(arguments[1]) if arguments[1] else None)
+    computing = _Computing(project, answers)
+    while (asked := _read(sys.stdin.buffer)) is not None:
+        computing.take(*asked)
+    os._exit(0)  # kernels may still run
+
+
+def _write(stream: IO[bytes], message: object) -> None:
+    content = pickle.dumps(message, protocol=5)
+    stream.write(len(content).to_bytes(8, "little"))
+    stream.write(content)
+    stream.flush()
+
+
+def _read(stream: IO[bytes]) -> Any:
+    """The next message of the other process, which this program started; None at the end."""
+    head = stream.read(8)
+    content = stream.read(int.from_bytes(head, "little")) if len(head) == 8 else b""
+    return pickle.loads(content) if content else None

@@ -1,0 +1,228 @@
+"""The step `Open`: create a project of two captures or scenes, and reconstruct the scenes that are missing."""
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatgraft.core.capture_orientation import estimate_up
+from splatgraft.editor.form import Form
+from splatgraft.editor.panel import Panel
+from splatgraft.editor.placement import Triple
+from splatgraft.editor.project import RenderedViews
+from splatgraft.editor.session import Session
+from splatgraft.editor.worker import LatestOnlyWorker
+from splatgraft.folders.input_description import InputDescription, describe_input
+from splatgraft.formats import SCENE_SUFFIXES
+from splatgraft.project.layout import Side
+
+if TYPE_CHECKING:
+    from splatgraft.editor.editor import Editor
+
+_HELP = (
+    "A capture is a folder of photos, a video, a COLMAP folder, or a folder with a transforms.json. "
+    "A trained scene (.ply, .spz, .sog, ...) works as well: its images are rendered from cameras around it."
+)
+_FIELDS = {
+    "source": "Object from",
+    "target": "Place into",
+    "source_scene": "Scene of the object",
+    "target_scene": "Scene of the place",
+}
+_SIDES: tuple[Side, Side] = ("source", "target")
+_VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+_PHOTOS = (".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff", ".webp")
+_UPS: dict[str, Triple | None] = {
+    "as found": None,
+    "+z": (0.0, 0.0, 1.0),
+    "-y": (0.0, -1.0, 0.0),
+    "+y": (0.0, 1.0, 0.0),
+    "-z": (0.0, 0.0, -1.0),
+    "+x": (1.0, 0.0, 0.0),
+    "-x": (-1.0, 0.0, 0.0),
+}
+_LOOKS = {"from around": False, "from within": True}
+_TRAINED_HINT = "A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
+_MAX_ROWS = 300  # entries of a folder that are listed
+
+
+class OpenPanel(Panel):
+    """Its controls."""
+
+    def __init__(self, editor: "Editor") -> None:
+        """Name no capture yet."""
+        super().__init__(editor)
+        self._paths = dict.fromkeys(_FIELDS, "")
+        self._found: dict[str, InputDescription | None] = dict.fromkeys(_SIDES)
+        self._browsed: tuple[str, Path] | None = None
+        """The field for which a folder of this machine is shown, and that folder."""
+        self._looker = LatestOnlyWorker(self._look, lambda error: editor.say(str(error), bad=True))
+
+    def close(self) -> None:
+        """End the thread."""
+        self._looker.close()
+
+    def build(self, form: Form) -> None:
+        """Describe a new project, or the facts of the open one."""
+        session, problem = self.editor.session, self.editor.problem
+        if problem is not None:
+            form.note(f"This project cannot be opened: {problem}", name="problem", bad=True)
+            form.note("Correct the file; the page opens it as soon as it is saved.")
+        elif session is None:
+            self._build_new(form)
+        else:
+            self._build_open(form, session)
+
+    # a new project
+
+    def _build_new(self, form: Form) -> None:
+        if self._browsed is not None:
+            self._build_folder(form, *self._browsed)
+            return
+        form.note(_HELP, name="help")
+        for name in _SIDES:
+            form.text(name, _FIELDS[name], self._paths[name], partial(self._set, name), hint="A path", browse=True)
+            self._on_browse(form, name)
+            found = self._found[name]
+            form.note(
+                "" if found is None else found.text, name=f"found_{name}", bad=bool(found and not found.is_usable)
+            )
+            form.upload(
+                f"upload_{name}", "Upload photos, a video or a scene", (*_PHOTOS, *_VIDEOS, *SCENE_SUFFIXES), many=True
+            )
+        usable = all(found is not None and found.is_usable for found in self._found.values())
+        form.button("start", "Start the project", self._create, main=True, disabled=not usable)
+        form.more()
+        for name in ("source_scene", "target_scene"):
+            form.text(name, _FIELDS[name], self._paths[name], partial(self._set, name), hint=_TRAINED_HINT, browse=True)
+            self._on_browse(form, name)
+
+    def _on_browse(self, form: Form, name: str) -> None:
+        given = self._paths[name]
+        start = Path(given).expanduser() if given and Path(given).expanduser().is_absolute() else Path.home()
+        start = next(folder for folder in (start, *start.parents) if folder.is_dir())
+        form.hidden(f"browse_{name}", lambda: setattr(self, "_browsed", (name, start)))
+
+    def _build_folder(self, form: Form, name: str, folder: Path) -> None:
+        """The folders and usable files of one folder of this machine."""
+
+        def go(row: str) -> None:
+            path = folder.parent if row == ".." else folder / row.removesuffix("/")
+            if path.is_dir():
+                self._browsed = (name, path)
+            else:
+                self._browsed = None
+                self._set(name, str(path))
+
+        form.note(f"{_FIELDS[name]}: {folder}", name="folder")
+        form.button("use_folder", "Use this folder", partial(self._use, name, folder), main=True)
+        form.button("close_folder", "Back", lambda: setattr(self, "_browsed", None))
+        try:
+            entries = sorted(folder.iterdir(), key=lambda path: (not path.is_dir(), path.name.lower()))
+        except OSError as error:
+            form.note(f"This folder cannot be read: {error.strerror}", bad=True)
+            entries = []
+        usable = (*_VIDEOS, *SCENE_SUFFIXES)
+        shown = [p for p in entries if not p.name.startswith(".") and (p.is_dir() or p.suffix.lower() in usable)]
+        photos = sum(p.suffix.lower() in _PHOTOS for p in entries)
+        form.note(f"{photos} photos are in this folder." if photos else "", name="photos")
+        rows = [f"{p.name}/" if p.is_dir() else p.name for p in shown[:_MAX_ROWS]]
+        form.rows("entries", ["..", *rows], go)
+
+    def _use(self, name: str, folder: Path) -> None:
+        self._browsed = None
+        self._set(name, str(folder))
+
+    def _set(self, name: str, value: str) -> None:
+        self._paths[name] = value.strip()
+        if name in _SIDES:
+            self._found[name] = None
+            self._looker.submit(dict(self._paths))
+
+    def _look(self, paths: dict[str, str]) -> None:
+        """Say what the paths are, before anything is made of them."""
+        for name in _SIDES:
+            self._found[name] = describe_input(parse_path(paths[name])) if paths[name] else None
+        self.editor.refresh()
+
+    def _create(self) -> None:
+        captures = parse_path(self._paths["source"]), parse_path(self._paths["target"])
+        names = ("source_scene", "target_scene")
+        scenes = [parse_path(self._paths[name]) if self._paths[name] else None for name in names]
+        self.editor.project.create(captures, scenes=(scenes[0], scenes[1]))
+        self.editor.open_project()
+        session = self.editor.require_session()
+        if all(session.files.without_photos):
+            # importing two scenes takes no training, so it starts at once
+            self.editor.run("reconstruct", _title(session))
+        else:
+            self.editor.say("the project is made; reconstruct both scenes next")
+
+    def uploaded(self, path: Path, use: str) -> None:
+        """Name an uploaded file, or the folder of uploaded photos."""
+        name = use.removeprefix("upload_")
+        if name in _SIDES and self.editor.session is None:
+            self._set(name, str(path.parent if path.suffix.lower() in _PHOTOS else path))
+
+    # the open project
+
+    def _build_open(self, form: Form, session: Session) -> None:
+        files = session.files
+        for index, side in enumerate(_SIDES):
+            form.note(self._line(session, index), name=f"facts_{side}")
+        have_both = files.source_scene.is_file() and files.target_scene.is_file()
+        why = session.why_stale(*(f"{side}/reconstruct" for side in _SIDES)) if have_both else None
+        form.note("" if why is None else f"Out of date: {why}", name="stale")
+        if not have_both or why is not None:
+            title = "Update both scenes" if have_both else _title(session)
+            form.button("build", title, lambda: self.editor.run("reconstruct", title), main=not have_both)
+        form.more()
+        for index, side in enumerate(_SIDES):
+            if files.without_photos[index]:
+                self._build_views(form, side, files.rendered_views[index])
+
+    def _build_views(self, form: Form, side: Side, views: RenderedViews) -> None:
+        """How images of a scene without photographs are rendered; an up along no axis is an option of its own."""
+        ups = dict(_UPS)
+        if views.up not in ups.values():
+            ups[f"({', '.join(f'{x:g}' for x in views.up or ())})"] = views.up
+        up = next(name for name, value in ups.items() if value == views.up)
+        look = next(name for name, value in _LOOKS.items() if value == views.is_within)
+
+        def set_views(made: RenderedViews) -> None:
+            self.editor.require_session().set_view(side, made)
+            self.editor.run("reconstruct", "Render the scene again")
+
+        form.choice(
+            f"look_{side}",
+            f"Cameras: {side}",
+            look,
+            list(_LOOKS),
+            lambda v: set_views(RenderedViews(views.up, _LOOKS[v])),
+        )
+        form.choice(
+            f"up_{side}", f"Up: {side}", up, list(ups), lambda v: set_views(RenderedViews(ups[v], views.is_within))
+        )
+
+    def _line(self, session: Session, index: int) -> str:
+        files, name = session.files, _FIELDS[_SIDES[index]]
+        scene = (files.source_scene, files.target_scene)[index]
+        cameras = (files.source_cameras, files.target_cameras)[index]
+        if not scene.is_file():
+            return f"{name}: not built yet"
+        text = f"{name}: ready"
+        if files.without_photos[index] and cameras.is_file():
+            made = session.scenes.cameras(cameras)
+            up = ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in estimate_up(made).tolist())
+            text += f", without photographs: {len(made)} pictures were rendered of it, with ({up}) as up"
+        return text
+
+
+def parse_path(text: str) -> Path:
+    """The path that a text field names; ValueError where it is empty."""
+    if not text.strip():
+        raise ValueError("path: expected one, found nothing")
+    return Path.cwd() / Path(text.strip()).expanduser()
+
+
+def _title(session: Session) -> str:
+    return "Import both scenes" if all(session.files.without_photos) else "Reconstruct both scenes"

@@ -1,0 +1,173 @@
+"""A window's camera: it turns around a point, and stays above the support and in front of walls."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatgraft.core.bounds import BoundingSphere
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.editor.picking import first_surface_hit
+
+Vector = Float[np.ndarray, "3"]
+_STEEPEST = math.radians(88.0)  # angle of the line of sight to the horizontal; up has no meaning at 90
+_TURN = 2 * math.pi  # radians for a drag over the canvas's height
+_NEAREST, _FARTHEST = 1e-3, 1e3  # distances to the pivot over the typical one of the scene
+_CLEAR = 0.03  # height above the support over the typical distance
+_BEFORE_WALL = 0.93  # a camera that would be in or behind a wall stands at this share of the way to it
+_FREE = 0.6  # distance from the pivot over the typical one within which nothing is a wall: a cup may stand there
+_SURFACES = 20_000  # Gaussians that count as walls, the ones that cover most
+_FRAMED = 1.5  # distance over which an object fills two thirds of the height
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """A view: where it stands, and the point around which it turns."""
+
+    world_from_camera: Float[np.ndarray, "4 4"]
+    """Pose, OpenCV axes."""
+    distance: float
+    """To the point around which it turns, along the optical axis, world units."""
+    half_height: float
+    """Tangent of half the vertical field of view."""
+    aspect: float = 0.0
+    """Width over height of a picture that must be visible as a whole; 0: any."""
+
+    @property
+    def position(self) -> Vector:
+        """Where the camera is."""
+        return self.world_from_camera[:3, 3]
+
+    @property
+    def forward(self) -> Vector:
+        """Unit direction of the line of sight."""
+        return self.world_from_camera[:3, 2]
+
+    @property
+    def pivot(self) -> Vector:
+        """The point around which the view turns."""
+        return self.position + self.distance * self.forward
+
+    def camera(self, width: int, height: int) -> Cameras:
+        """The camera for a canvas, in whose middle the whole picture is."""
+        half = self.half_height * max(1.0, self.aspect * height / width if self.aspect else 1.0)
+        focal = height / (2 * half)
+        intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
+        pose = torch.tensor(self.world_from_camera, dtype=torch.float32)
+        return Cameras(pose[None], intrinsics[None], torch.tensor([[width, height]]), ("window",))
+
+    def turned(self, dx: float, dy: float, *, up: Vector) -> "Orbit":
+        """Turn around the pivot by a drag over the canvas's height."""
+        level = math.asin(float(np.clip(self.forward @ up, -1, 1)))
+        wanted = float(np.clip(level - 0.5 * _TURN * dy, -_STEEPEST, _STEEPEST))
+        ahead = self.forward - (self.forward @ up) * up
+        if np.linalg.norm(ahead) < 1e-6:
+            ahead = -self.world_from_camera[:3, 1] + (self.world_from_camera[:3, 1] @ up) * up
+        ahead = _unit(ahead)
+        angle = -_TURN * dx
+        ahead = math.cos(angle) * ahead + math.sin(angle) * np.cross(up, ahead)
+        return self.looking(self.pivot, math.cos(wanted) * ahead + math.sin(wanted) * up, self.distance, up=up)
+
+    def moved(self, dx: float, dy: float) -> "Orbit":
+        """Move sideways by a drag over the canvas's height, so that the pivot's plane follows the pointer."""
+        shift = (
+            -2
+            * self.half_height
+            * self.distance
+            * (dx * self.world_from_camera[:3, 0] + dy * self.world_from_camera[:3, 1])
+        )
+        pose = self.world_from_camera.copy()
+        pose[:3, 3] += shift
+        return replace(self, world_from_camera=pose)
+
+    def zoomed(self, factor: float, *, scale: float) -> "Orbit":
+        """Change the distance to the pivot; `scale` is a typical distance of the scene."""
+        distance = float(np.clip(self.distance * factor, _NEAREST * scale, _FARTHEST * scale))
+        pose = self.world_from_camera.copy()
+        pose[:3, 3] = self.pivot - distance * self.forward
+        return replace(self, world_from_camera=pose, distance=distance)
+
+    def framing(self, sphere: BoundingSphere, *, up: Vector) -> "Orbit":
+        """The view of a sphere that fills two thirds of the height, from the direction that it has."""
+        center = sphere.center.double().numpy()
+        distance = _FRAMED * sphere.radius / math.sin(math.atan(self.half_height))
+        return self.looking(center, center - self.position, distance, up=up)
+
+    def looking(self, pivot: Vector, direction: Vector, distance: float, *, up: Vector) -> "Orbit":
+        """The view of a point along a direction."""
+        forward = _unit(direction)
+        right = np.cross(forward, up)
+        if np.linalg.norm(right) < 1e-6:
+            right = self.world_from_camera[:3, 0]
+        right = _unit(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+        pose[:3, 3] = pivot - distance * forward
+        return replace(self, world_from_camera=pose, distance=distance)
+
+
+def through(camera: Cameras, distance: float) -> Orbit:
+    """The view through a camera of a capture, which shows its whole picture however narrow the canvas is."""
+    half_height = camera.height / (2 * float(camera.intrinsics[0, 1, 1]))
+    return Orbit(camera.world_from_camera[0].double().numpy(), distance, half_height, camera.width / camera.height)
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSpace:
+    """Where a camera may be: above the support, and not in or behind a wall."""
+
+    up: Vector
+    """Unit up direction."""
+    floor: float
+    """Lowest height along `up`, world units."""
+    walls: Gaussians
+    """Gaussians of the place's surfaces, without objects."""
+    scale: float
+    """Typical distance of the scene, world units."""
+
+    @staticmethod
+    def of(scene: Gaussians, cameras: Cameras, up: Float[Tensor, "3"], foot: Float[Tensor, "3"] | None) -> "FreeSpace":
+        """The space of a scene; below the foot of an object a camera may be only as deep as the photos were taken."""
+        heights = cameras.centers @ up
+        floor, scale = float(heights.min()), typical_distance(cameras)
+        if foot is not None:
+            floor = min(floor, float(foot @ up) + _CLEAR * scale)
+        cover = torch.nn.functional.logsigmoid(scene.opacity_logits) + scene.log_scales.sort(1).values[:, 1:].sum(1)
+        chosen = cover.topk(min(_SURFACES, scene.count)).indices
+        return FreeSpace(up.double().numpy(), floor, scene.select(chosen).with_sh_degree(0), scale)
+
+    def kept(self, view: Orbit) -> Orbit:
+        """The view, or one from the nearest place on the way to its pivot where a camera may be."""
+        pivot, back = view.pivot, -view.forward
+        distance = view.distance
+        ray = torch.tensor(back).float()
+        begin = pivot + _FREE * min(distance, self.scale) * back
+        hit = first_surface_hit(self.walls, torch.tensor(begin).float(), ray)
+        if hit is not None:
+            way = float((hit.double().numpy() - pivot) @ back)
+            if way < distance / _BEFORE_WALL:
+                distance = _BEFORE_WALL * way
+        place = pivot + distance * back
+        short = self.floor - float(place @ self.up)
+        if short <= 0:
+            return view if distance == view.distance else view.looking(pivot, -back, distance, up=self.up)
+        if float(pivot @ self.up) >= self.floor:
+            # the same distance, less deep
+            place = place + short * self.up
+            return view.looking(pivot, pivot - place, float(np.linalg.norm(pivot - place)), up=self.up)
+        pose = view.world_from_camera.copy()
+        pose[:3, 3] = place + short * self.up
+        return replace(view, world_from_camera=pose)
+
+
+def typical_distance(cameras: Cameras) -> float:
+    """Median distance of camera centres from their mean, world units; positive."""
+    return max(1e-6, float((cameras.centers - cameras.centers.mean(0)).norm(dim=1).median()))
+
+
+def _unit(vector: Vector) -> Vector:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)

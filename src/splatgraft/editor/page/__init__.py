@@ -1,1 +1,0 @@
-"""The editor's page, built with viser."""

@@ -1,0 +1,342 @@
+"""The step `Select`: select the object by clicks in photos or in the scene, by masks or a box, and by a brush."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.editor.form import Form
+from splatgraft.editor.panel import CORNERS, BoxDrag, Panel, Pointer, box_over, view_camera
+from splatgraft.editor.photo_view import PhotoView, prompt_of, seen_best, with_click
+from splatgraft.editor.picking import Ray, Rectangle, brush_selection, first_surface_hit, in_rectangle, interpolate_rays
+from splatgraft.editor.session import Session
+from splatgraft.editor.state import EditState
+from splatgraft.editor.stream import View
+from splatgraft.editor.worker import LatestOnlyWorker
+from splatgraft.segmentation import Box, Keep, default_box
+
+if TYPE_CHECKING:
+    from splatgraft.editor.editor import Editor
+
+_SOURCES = {
+    "masks beside the photos, else cut from them": "auto",
+    "masks beside the photos": "files",
+    "clicks, or a box around the object": "grabcut",
+    "a network (BiRefNet)": "birefnet",
+    "no masks: everything inside the box": "box",
+}
+_KEEP: dict[str, Keep] = {"all large pieces": "substantial", "only the largest piece": "largest", "all pieces": "all"}
+_TAKES_POINTS = (None, "auto", "grabcut", "sam2")
+"""Values of `mask_source` of which clicks count."""
+_GREEN, _RED, _ORANGE = "#3cdc5a", "#eb283c", "#ff9628"
+
+
+class SelectPanel(Panel):
+    """Its controls, and the source in the view."""
+
+    def __init__(self, editor: "Editor") -> None:
+        """Use no brush yet."""
+        super().__init__(editor)
+        self._marks_object, self._uses_brush, self._adds, self._is_alone = True, False, False, False
+        self._brush_size = 0.1
+        self._stroke: list[Ray] = []
+        self._touched: Tensor | None = None
+        self._held_box: BoxDrag | None = None
+        self._outlines: tuple[EditState | None, dict[int, Any]] = (None, {})
+        """Outlines that the clicks of one state give, by photo."""
+        self._finder = LatestOnlyWorker(self._find_outline, lambda error: editor.say(str(error), bad=True))
+
+    def close(self) -> None:
+        """End the thread."""
+        self._finder.close()
+
+    def enter(self) -> None:
+        """Begin at a photo, of which clicks are plain."""
+        if self.editor.session is not None and self.editor.cameras() is not None:
+            self.editor.to_photo(0)
+
+    def leave(self) -> None:
+        """Put the brush away."""
+        self._uses_brush, self._stroke, self._touched = False, [], None
+
+    def build(self, form: Form) -> None:
+        """Describe the controls."""
+        editor, session = self.editor, self.editor.require_session()
+        if not session.files.source_scene.is_file():
+            form.note("The scene with the object is not there yet: see Open.")
+            return
+        state, selection = session.state, session.selection()
+        form.note(self._said(session, bool(selection is not None and selection.any())), name="selection")
+        for line in self._warnings(session):
+            form.note(line, name="warning", bad=True)
+        marks = ("the object", "what is beside it")
+        form.choice(
+            "marks", "A click marks", marks[not self._marks_object], marks,
+            lambda value: setattr(self, "_marks_object", value == marks[0]),
+            hint="Alt or the right button: what is beside it",
+        )  # fmt: skip
+        editor.add_photos(form)
+        form.button("cut", "Cut out the object", lambda: editor.run("segment", "Cut out the object"), main=True)
+        form.check(
+            "brush",
+            "Brush",
+            self._uses_brush,
+            self._use_brush,
+            hint="Drag over the picture (B); Shift and drag: a rectangle",
+        )
+        strokes = ("removes", "adds")
+        if self._uses_brush:
+            form.choice(
+                "stroke", "The brush", strokes[self._adds], strokes, lambda v: setattr(self, "_adds", v == strokes[1])
+            )
+        form.check("alone", "Object alone", self._is_alone, lambda value: setattr(self, "_is_alone", value))
+        form.more()
+        form.button("no_clicks", "Forget all clicks", lambda: self._set(prompts=None), disabled=state.prompts is None)
+        form.button(
+            "no_strokes", "Forget all strokes", lambda: self._set(corrections=None), disabled=state.corrections is None
+        )
+        form.slider(
+            "brush_size", "Brush size", self._brush_size, (0.01, 0.5, 0.01),
+            lambda value: setattr(self, "_brush_size", value), hint="Over the distance to the surface",
+        )  # fmt: skip
+        name = next(
+            (n for n, value in _SOURCES.items() if value == (state.mask_source or "auto")), next(iter(_SOURCES))
+        )
+        form.choice(
+            "outlines", "Outlines from", name, list(_SOURCES), lambda value: self._set(mask_source=_SOURCES[value])
+        )
+        keep = next((n for n, value in _KEEP.items() if value == (state.keep or get_args(Keep)[0])), next(iter(_KEEP)))
+        form.choice("keep", "Keep", keep, list(_KEEP), lambda value: self._set(keep=_KEEP[value]))
+        box = session.box()
+        form.check("box", "Box around the object", box is not None, self._toggle_box)
+        if state.box is not None:
+            numbers = state.box
+            form.numbers("box_from", "Box from", numbers[:3], lambda v: self._set(box=(*v, *numbers[3:])))
+            form.numbers("box_to", "Box to", numbers[3:], lambda v: self._set(box=(*numbers[:3], *v)))
+            form.buttons(
+                "box_parts",
+                {
+                    "Add what is in the box": lambda: self._box_corrects(True),
+                    "Remove it": lambda: self._box_corrects(False),
+                },
+            )
+
+    def _said(self, session: Session, is_any: bool) -> str:
+        if not is_any:
+            return "Click on the object, in two or three photos; then cut it out."
+        if session.scenes.segmented() is not None:
+            return "The object is orange. Where it is wrong, click or brush, and cut it out again."
+        return "What is in the box is orange. Cut it out, or click on the object in two or three photos first."
+
+    def _warnings(self, session: Session) -> list[str]:
+        """Masks that the capture names, and that are missing."""
+        missing = session.scenes.missing_masks(session.files.source_cameras)
+        if not missing:
+            return []
+        names = ", ".join(path.name for path in missing[:3]) + (
+            f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+        )
+        return [f"Mask {names} is missing." if len(missing) == 1 else f"Masks {names} are missing."]
+
+    def tools(self) -> dict[str, Any]:
+        """Strokes of the brush, and rectangles."""
+        return {"paint": self._uses_brush, "rectangle": True}
+
+    # the picture
+
+    def picture(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
+        """The source, or a photo of it, with what is selected."""
+        session, pictures = self.editor.require_session(), self.editor.pictures
+        assert pictures is not None
+        which = session.selection()
+        if self._touched is not None and which is not None:
+            which = which | self._touched if self._adds else which & ~self._touched
+        return pictures.draw_source(which, camera, photo=view.photo, alone=self._is_alone), "full quality"
+
+    def overlay(self, view: View, camera: Cameras) -> dict[str, Any]:
+        """Clicks and the outline that they give in a photo; the box elsewhere."""
+        session, pictures = self.editor.require_session(), self.editor.pictures
+        assert pictures is not None
+        dots: list[dict[str, Any]] = []
+        lines: list[dict[str, Any]] = []
+        if view.photo is not None:
+            name = session.scenes.cameras(session.files.source_cameras).names[view.photo]
+            size = pictures.source_photo(view.photo)[1]
+            shown = PhotoView(size, (camera.width, camera.height))
+            prompt = prompt_of(session.state.prompts, name)
+            for points, color in ((prompt.inside, _GREEN), (prompt.outside, _RED)):
+                at = [shown.place_of(x / size[0], y / size[1]) for x, y in points.tolist()]
+                dots += [{"at": [round(x, 4), round(y, 4)], "color": color} for x, y in at]
+            lines = [
+                {"points": [shown.place_of(*point) for point in line], "color": _GREEN, "closed": True}
+                for line in self._outline(session, view.photo)
+            ]
+        elif (box := session.box()) is not None:
+            return box_over(box, camera, _ORANGE)
+        return {"dots": dots, "lines": lines}
+
+    def _outline(self, session: Session, photo: int) -> list[list[tuple[float, float]]]:
+        """The outline in a photo; where it is not known yet, it is looked for."""
+        state = session.state
+        if not state.prompts or state.mask_source not in _TAKES_POINTS:
+            return []
+        known, found = self._outlines
+        if known is None or known.prompts is not state.prompts:
+            self._outlines = (state, found := {})
+        if photo not in found:
+            found[photo] = []
+            self._finder.submit((state, photo))
+        return found[photo]
+
+    def _find_outline(self, asked: tuple[EditState, int]) -> None:
+        state, photo = asked
+        pictures = self.editor.pictures
+        if pictures is None:
+            return
+        lines = pictures.outline(state, photo)
+        known, found = self._outlines
+        if known is not None and known.prompts is state.prompts:
+            found[photo] = lines
+            self.editor.stream.touch()
+
+    # the pointer
+
+    def pointer(self, view: View, pointer: Pointer) -> None:
+        """Take clicks, strokes, rectangles and drags of the box."""
+        if pointer.what == "rectangle":
+            camera = view_camera(self.editor, view)
+            (x, y), (u, v) = pointer.place, pointer.to
+            part = Rectangle((min(x, u), min(y, v)), (max(x, u), max(y, v)))
+            self._correct(in_rectangle(self._scene().means, camera, part), add=self._adds != pointer.alt)
+        elif pointer.on in CORNERS:
+            self._drag_box(view, pointer)
+        elif self._uses_brush:
+            self._paint(view, pointer)
+        elif pointer.what == "click":
+            self._mark(view, pointer)
+
+    def _mark(self, view: View, pointer: Pointer) -> None:
+        """Add a point to the photo in view, else to the one that sees the surface most alike, and show that."""
+        editor, session, pictures = self.editor, self.editor.require_session(), self.editor.pictures
+        assert pictures is not None
+        cameras, photo = session.scenes.cameras(session.files.source_cameras), view.photo
+        if photo is not None:
+            size = pictures.source_photo(photo)[1]
+            pixel = PhotoView(size, view.canvas).pixel_at(pointer.place)
+            if pixel is None:
+                raise ValueError("Click in the photo, not beside it.")
+        else:
+            ray = pointer.ray(view_camera(editor, view))
+            hit = first_surface_hit(self._scene(), ray.origin, ray.direction)
+            if hit is None:
+                raise ValueError("Click on a surface: there is none under the pointer.")
+            photo, pixel = seen_best(hit, ray.direction, cameras)
+            size = pictures.source_photo(photo)[1]
+            scale = size[0] / cameras[photo].width
+            pixel = (pixel[0] * scale, pixel[1] * scale)
+            editor.to_photo(photo)
+        on_object = self._marks_object != pointer.alt
+        prompts = with_click(
+            session.state.prompts, cameras.names[photo], pixel, on_object=on_object, longer_side=max(size)
+        )
+        state, takes = replace(session.state, prompts=prompts), session.state.mask_source in _TAKES_POINTS
+        session.change(state if takes else replace(state, mask_source="auto"))
+        count = sum(len(p.inside) + len(p.outside) for p in (prompts or {}).values())
+        clicks = "1 click" if count == 1 else f"{count} clicks"
+        others = "" if takes else "; outlines are found by clicks now"
+        again = "Press Cut out." if session.scenes.segmented() is None else "Cut out again to use them."
+        editor.say(f"{clicks} in {len(prompts or {})} of the photos{others}. {again}")
+
+    def _drag_box(self, view: View, pointer: Pointer) -> None:
+        box, held = self.editor.require_session().box(), self._held_box
+        if pointer.what == "down" and box is not None:
+            self._held_box = BoxDrag(box, pointer.on, view_camera(self.editor, view))
+        elif held is not None and pointer.what != "move":
+            self._held_box = None
+            if pointer.what == "up":
+                self._set_box(held.at(pointer.place))
+
+    # the brush
+
+    def _use_brush(self, value: bool) -> None:
+        self._uses_brush = value
+        view = self.editor.editing()
+        if value and view is not None and view.photo is not None:
+            view.photo = None  # the brush paints on the scene
+        on = "the brush is on: drag or click in the view; B switches it off, so that a drag rotates the view again"
+        self.editor.say(on if value else "the brush is off")
+
+    def _paint(self, view: View, pointer: Pointer) -> None:
+        ray = pointer.ray(view_camera(self.editor, view))
+        if pointer.what in ("down", "click"):
+            self._stroke, self._touched = [ray], torch.zeros(self._scene().count, dtype=torch.bool)
+            new = [ray]
+        elif self._touched is None:
+            return
+        else:
+            new = interpolate_rays(self._stroke[-1], ray, size=self._brush_size)
+            self._stroke = [ray]
+        if pointer.what == "cancel":
+            self._touched = None
+            return
+        assert self._touched is not None
+        self._touched = self._touched | brush_selection(self._scene(), new, size=self._brush_size)
+        self.editor.stream.touch(moving=True)
+        if pointer.what in ("up", "click"):
+            touched, self._touched = self._touched, None
+            if not bool(touched.any()):
+                raise ValueError("There is no surface under the stroke.")
+            self._correct(touched, add=self._adds != pointer.alt)
+
+    def _correct(self, touched: Tensor, *, add: bool) -> None:
+        session = self.editor.require_session()
+        session.correct(touched, add=add)
+        again = "Press Cut out." if session.scenes.segmented() is None else "Cut out again to use it."
+        self.editor.say(f"{'added' if add else 'removed'} what the stroke touched. {again}")
+
+    def key(self, view: View, key: str) -> bool:
+        """B takes the brush or puts it away."""
+        if key == "b":
+            self._use_brush(not self._uses_brush)
+        return key == "b"
+
+    # the box
+
+    def _toggle_box(self, value: bool) -> None:
+        if not value:
+            self._set(box=None)
+        elif self.editor.require_session().box() is None:
+            self._set_box(self._default_box())
+            self.editor.say(
+                "leave the photo by dragging the view; then drag the two corners until the box holds the object"
+            )
+
+    def _box_corrects(self, add: bool) -> None:
+        box = self.editor.require_session().box()
+        if box is not None:
+            self._correct(box.contains(self._scene().means), add=add)
+
+    def _default_box(self) -> Box:
+        """The box around the cameras' common focus; where there is no capture, the middle half of the scene."""
+        session = self.editor.require_session()
+        try:
+            return default_box(session.scenes.capture(session.files.source_cameras))
+        except ValueError:
+            lower, upper = self._scene().means.quantile(torch.tensor([0.25, 0.75]), 0)
+            return Box(lower, torch.maximum(upper, lower + 1e-6))
+
+    def _set_box(self, box: Box) -> None:
+        self._set(box=tuple(round(x, 6) for x in (*box.lower.tolist(), *box.upper.tolist())))
+
+    def _set(self, **fields: object) -> None:
+        session = self.editor.require_session()
+        session.change(replace(session.state, **fields))  # pyright: ignore[reportArgumentType]
+
+    def _scene(self) -> Gaussians:
+        session = self.editor.require_session()
+        return session.scenes.gaussians(session.files.source_scene)

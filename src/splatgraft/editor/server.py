@@ -1,0 +1,319 @@
+"""The editor's web server: one page, one websocket for each window, files, uploads, and access control before all.
+
+What a client sends is bounded: the size of a message and of an upload, and the number of windows. The oldest window
+edits, all others watch. A message that no page sends is one line on standard error. Nothing here loads torch.
+"""
+
+import asyncio
+import contextlib
+import itertools
+import json
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import Any, Protocol
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from splatgraft.editor.access import allowed_query, cookie_name, why_refused
+from splatgraft.runtime.files import atomic_write
+
+FILES_PREFIX = "files/"
+"""First part of the addresses of the project's files, below the page's own address."""
+_ASSETS = {"": "index.html", "editor.js": "editor.js", "editor.css": "editor.css"}
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".webp": "image/webp",
+    ".gif": "image/gif",
+    ".mp4": "video/mp4",
+}
+_POLICY = "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'"
+_MAX_MESSAGE_BYTES = 1 << 16  # a page's largest message is a path or a file's name
+_MAX_UPLOAD_BYTES = 1 << 30  # of one upload, which goes to the disk
+_MAX_WINDOWS = 16  # each is drawn for
+_MAX_UPLOADS = 4  # under way at once
+_START_SECONDS = 60  # limit against a hang
+
+
+class Client(Protocol):
+    """What the server tells of its windows; `Editor` is one."""
+
+    def opened(self, window: "Window") -> None:
+        """A window has opened."""
+
+    def received(self, window: "Window", message: dict[str, Any]) -> None:
+        """A window has sent a message; ValueError, KeyError or TypeError where no page sends it."""
+
+    def closed(self, window: "Window") -> None:
+        """A window has closed."""
+
+    def file(self, name: str) -> Path | None:
+        """The file that is served for a name; None where there is none."""
+
+    def upload_path(self, name: str) -> Path:
+        """Where an uploaded file of that name goes; ValueError where the name is none."""
+        ...
+
+    def uploaded(self, path: Path, use: str) -> None:
+        """A file was uploaded for the control `use`."""
+
+
+class Window:
+    """One browser window. Only the newest message of each kind waits to be sent."""
+
+    def __init__(self, number: int, loop: asyncio.AbstractEventLoop) -> None:
+        """Send nothing yet."""
+        self.number = number
+        self._loop, self._wake = loop, asyncio.Event()
+        self._waiting: dict[str, str | bytes] = {}
+        self._lock = threading.Lock()
+
+    def send(self, kind: str, content: str | bytes) -> None:
+        """Send a message from any thread; it replaces one of that kind that still waits."""
+        with self._lock:
+            self._waiting[kind] = content
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(self._wake.set)
+
+    async def pump(self, connection: WebSocket) -> None:
+        """Send what waits until the connection ends."""
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            with self._lock:
+                waiting, self._waiting = self._waiting, {}
+            for content in waiting.values():
+                if isinstance(content, bytes):
+                    await connection.send_bytes(content)
+                else:
+                    await connection.send_text(content)
+
+
+class Server:
+    """The server in a thread of its own."""
+
+    def __init__(self, token: str, *, host: str, port: int) -> None:
+        """Start to listen at `port` or the next free one; each request must carry the token."""
+        self._token = token
+        self._client: Client | None = None
+        self._windows: list[Window] = []
+        self._numbers = itertools.count(1)
+        self._connections, self._uploads = 0, 0
+        self._lock = threading.Lock()
+        listener = _listener(host, port)
+        self.port: int = listener.getsockname()[1]
+        routes = [
+            Route("/upload", self._upload, methods=["POST"]),
+            Route(f"/{FILES_PREFIX}{{name:path}}", self._file),
+            WebSocketRoute("/socket", self._socket),
+            Route("/{name:path}", self._page),
+        ]
+        app = _Guard(Starlette(routes=routes), token)
+        config = uvicorn.Config(
+            app, log_config=None, lifespan="off", ws="websockets-sansio", ws_max_size=_MAX_MESSAGE_BYTES,
+            ws_per_message_deflate=False, timeout_graceful_shutdown=1, server_header=False, timeout_keep_alive=5,
+        )  # fmt: skip
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(
+            target=self._server.run, args=([listener],), name="splatgraft server", daemon=True
+        )
+        self._thread.start()
+
+    def attach(self, client: Client) -> None:
+        """Tell a client of the windows from now on, and of those that are open."""
+        with self._lock:
+            self._client = client
+            for window in self._windows:
+                client.opened(window)
+
+    def close(self) -> None:
+        """Stop the server."""
+        self._server.should_exit = True
+        self._thread.join(_START_SECONDS)
+
+    # requests
+
+    async def _page(self, request: Request) -> Response:
+        name = _ASSETS.get(request.path_params["name"])
+        if name is None:
+            return _no_file()
+        query = request.url.query
+        allowed = allowed_query(f"/?{query}" if query else "/")
+        if allowed is not None:
+            return RedirectResponse(allowed, 302)
+        content = resources.files("splatgraft.editor").joinpath("static", name).read_bytes()
+        response = Response(content, media_type=_TYPES[Path(name).suffix])
+        cookie = f"{cookie_name(request.headers['Host'])}={self._token}; HttpOnly; SameSite=Strict; Path=/"
+        response.headers["Set-Cookie"] = cookie
+        response.headers["Cache-Control"] = "no-cache"
+        return response
+
+    async def _file(self, request: Request) -> Response:
+        """A file of the project."""
+        try:
+            found = None if self._client is None else self._client.file(request.path_params["name"])
+            if found is None or not found.is_file():
+                return _no_file()
+            return FileResponse(found, media_type=_TYPES.get(found.suffix, "application/octet-stream"))
+        except (OSError, ValueError):  # a name that no file can have
+            return _no_file()
+
+    async def _upload(self, request: Request) -> Response:
+        """Store a file that the window that edits sends; it goes to the disk part by part."""
+        query, client = request.query_params, self._client
+        with self._lock:
+            is_editing = bool(self._windows) and query.get("window") == str(self._windows[0].number)
+        if client is None or not is_editing:
+            return _refusal("another window edits", 403)
+        if self._uploads >= _MAX_UPLOADS:
+            return _refusal(f"expected at most {_MAX_UPLOADS} uploads at once, found one more", 429)
+        self._uploads += 1
+        try:
+            path = client.upload_path(query.get("name", ""))
+            announced = request.headers.get("Content-Length", "0")
+            if not announced.isdecimal() or int(announced) > _MAX_UPLOAD_BYTES:
+                return _too_large()
+            size = 0
+            with atomic_write(path) as stream:
+                async for part in request.stream():
+                    size += len(part)
+                    if size > _MAX_UPLOAD_BYTES:
+                        return _too_large()
+                    await asyncio.to_thread(stream.write, part)
+        except (ValueError, OSError) as error:
+            return _refusal(" ".join(str(error).split()), 400)
+        finally:
+            self._uploads -= 1
+        await asyncio.to_thread(client.uploaded, path, query.get("use", ""))
+        return PlainTextResponse(str(path))
+
+    async def _socket(self, connection: WebSocket) -> None:
+        """Serve one window until it closes."""
+        await connection.accept()
+        if self._connections >= _MAX_WINDOWS:
+            reason = f"splatgraft: expected at most {_MAX_WINDOWS} windows, found one more; close another"
+            await connection.close(1013, reason)
+            return
+        self._connections += 1
+        window = Window(next(self._numbers), asyncio.get_running_loop())
+        pump = asyncio.create_task(window.pump(connection))
+        try:
+            with self._lock:
+                self._windows.append(window)
+                if self._client is not None:
+                    self._client.opened(window)
+            while connection.application_state is WebSocketState.CONNECTED:
+                await self._take(window, await connection.receive())
+        except WebSocketDisconnect:
+            pass
+        finally:
+            self._connections -= 1
+            pump.cancel()
+            with contextlib.suppress(asyncio.CancelledError, Exception):
+                await pump
+            with self._lock:
+                self._windows.remove(window)
+                if self._client is not None:
+                    self._client.closed(window)
+
+    async def _take(self, window: Window, event: Any) -> None:
+        if event["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(event.get("code", 1000))
+        try:
+            message = json.loads(event.get("text") or "", parse_constant=_no_number)
+            if self._client is not None:
+                self._client.received(window, dict(message))
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
+            # not the error's text, which may quote what was sent
+            found = f"one that is not ({type(error).__name__})"
+            sys.stderr.write(f"splatgraft: expected a message of the editor's own page, found {found}\n")
+
+
+class _Guard:
+    """Access control before an application, and headers behind it."""
+
+    def __init__(self, app: ASGIApp, token: str) -> None:
+        self._app, self._token = app, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        # a repeated header is joined, so that it matches no accepted value
+        headers: dict[str, str] = {}
+        for raw, value in scope["headers"]:
+            name, text = raw.decode("latin-1").title(), value.decode("latin-1")
+            headers[name] = text if name not in headers else headers[name] + ("; " if name == "Cookie" else ", ") + text
+        if scope["type"] == "websocket":
+            headers["Upgrade"] = "websocket"
+        path = f"{scope['path']}?{scope['query_string'].decode('latin-1')}"
+        refused = why_refused(self._token, headers, path)
+        if refused is not None:
+            await _refusal(refused, 403)(scope, receive, send)
+            return
+
+        async def guarded(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                found = {name.lower() for name, _ in message["headers"]}
+                # no other site may embed the page in a frame (clickjacking), and the address holds the token
+                extra = {
+                    "X-Frame-Options": "DENY",
+                    "Referrer-Policy": "no-referrer",
+                    "X-Content-Type-Options": "nosniff",
+                }
+                if not scope["path"].startswith(
+                    f"/{FILES_PREFIX}"
+                ):  # reports and exported pages hold scripts of their own
+                    extra["Content-Security-Policy"] = _POLICY
+                message["headers"] += [
+                    (k.encode(), v.encode()) for k, v in extra.items() if k.lower().encode() not in found
+                ]
+            await send(message)
+
+        await self._app(scope, receive, guarded)
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    """A socket at the port, or at the next free one."""
+    for tried in range(port, port + 100):
+        listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, sys.platform != "win32")
+        try:
+            listener.bind((host, tried if port else 0))
+        except OSError:
+            listener.close()
+            continue
+        listener.listen(64)
+        return listener
+    raise ValueError(f"port {port}: expected a free one here or among the next 100, found none")
+
+
+def _no_number(text: str) -> Callable[[], None]:
+    raise ValueError(f"expected a finite number, found {text}")
+
+
+def _too_large() -> Response:
+    gib = _MAX_UPLOAD_BYTES >> 30
+    return _refusal(f"expected an upload of at most {gib} GiB; write the path of the file instead", 413)
+
+
+def _refusal(text: str, status: int) -> Response:
+    return PlainTextResponse(f"splatgraft: {text}\n", status)
+
+
+def _no_file() -> Response:
+    return _refusal("no such file", 404)

@@ -1,0 +1,192 @@
+"""One stream of pictures for each window: camera, canvas and state go in, the newest picture comes out.
+
+Moving pictures have the resolution that a time budget allows. When nothing has moved for a moment, one of full size and
+quality follows.
+"""
+
+import io
+import json
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from splatgraft.core.cameras import Cameras
+from splatgraft.editor.orbit import Orbit
+from splatgraft.editor.server import Window
+
+_BUDGET_SECONDS = 1 / 20  # of a moving picture; sending and showing it takes the rest of a fifteenth
+_SMALLEST = 0.3  # share of the canvas's sides; smaller pictures take hardly less time, because all Gaussians are sorted
+_REST_SECONDS = 0.25  # without a move, until the picture of full size is begun
+_MOVING_QUALITY, _FULL_QUALITY = 80, 92  # of JPEG
+_LARGEST, _LEAST = 1920, 16  # pixels of a canvas's longer side, which the browser enlarges, and of any side
+_IN_FLIGHT = 2  # pictures on their way: one is shown while the next one is drawn
+_LOST_SECONDS = 2.0  # after which a picture that was not acknowledged counts as shown
+
+
+@dataclass(eq=False)
+class View:
+    """What one window shows."""
+
+    window: Window
+    size: tuple[int, int] = (0, 0)
+    """Width and height of its canvas, pixels; zeros until it has told."""
+    orbits: dict[str, Orbit] = field(default_factory=dict)
+    """Its view of each scene, by side."""
+    split: float = 0.0
+    """Share of the width left of which the picture before is shown."""
+    version: int = 0
+    """Grows when something changes that its picture shows."""
+    drawn: tuple[int, float] = (-1, 0.0)
+    """Version and size, over the canvas's, of the picture that was drawn last."""
+    photo: int | None = None
+    """Number of the photo from whose place it looks; None: from elsewhere."""
+    moved_at: float = 0.0
+    """When it moved last."""
+    sent: int = 0
+    """Number of pictures sent."""
+    shown: int = 0
+    """Number of the newest picture that its window has shown."""
+    sent_at: float = 0.0
+    scale: float = 0.5
+    """Size of moving pictures over the canvas's."""
+
+    def touched(self, *, moving: bool) -> None:
+        """Say that what it shows has changed."""
+        self.version += 1
+        if moving:
+            self.moved_at = time.monotonic()
+
+    @property
+    def canvas(self) -> tuple[int, int]:
+        """Width and height of its full picture."""
+        most = min(1.0, _LARGEST / max(self.size))
+        width, height = (max(_LEAST, round(most * side)) for side in self.size)
+        return width, height
+
+
+class Artist(Protocol):
+    """Draws; `Editor` is one."""
+
+    def draw(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], dict[str, Any]]:
+        """A picture of a window's view, and what lies over it."""
+        ...
+
+    def orbit(self, view: View) -> Orbit | None:
+        """Where a window looks from; None where there is nothing to see."""
+        ...
+
+
+class Stream:
+    """The thread that draws for all windows, in turn."""
+
+    def __init__(self, artist: Artist, on_error: Callable[[Exception], None]) -> None:
+        """Draw for no window yet."""
+        self._artist, self._on_error = artist, on_error
+        self.views: list[View] = []
+        """In the order in which their windows opened."""
+        self._wake = threading.Condition()
+        self._open = True
+        self._thread = threading.Thread(target=self._run, name="splatgraft stream", daemon=True)
+        self._thread.start()
+
+    def add(self, view: View) -> None:
+        """Draw for a window from now on."""
+        with self._wake:
+            self.views.append(view)
+            self._wake.notify()
+
+    def remove(self, window: Window) -> None:
+        """Draw for a window no more."""
+        with self._wake:
+            self.views = [view for view in self.views if view.window is not window]
+
+    def of(self, window: Window) -> View | None:
+        """The view of a window; None where it has closed."""
+        return next((view for view in self.views if view.window is window), None)
+
+    def touch(self, view: View | None = None, *, moving: bool = False) -> None:
+        """Draw a window anew, or all."""
+        with self._wake:
+            for one in self.views if view is None else [view]:
+                one.touched(moving=moving)
+            self._wake.notify()
+
+    def acknowledge(self, view: View, number: int) -> None:
+        """A window has shown a picture."""
+        with self._wake:
+            view.shown = max(view.shown, min(number, view.sent))
+            self._wake.notify()
+
+    def close(self) -> None:
+        """End the thread after the picture that it draws."""
+        with self._wake:
+            self._open = False
+            self._wake.notify()
+        self._thread.join(timeout=1.0)
+
+    def _run(self) -> None:
+        while True:
+            with self._wake:
+                if not self._open:
+                    return
+                now = time.monotonic()
+                waits = [(self._wait(view, now), view) for view in self.views]
+                soon = min((wait for wait, _ in waits), default=np.inf)
+                if soon > 0:
+                    self._wake.wait(timeout=None if soon == np.inf else soon)
+                    continue
+                # windows take turns
+                view = min((view for wait, view in waits if wait <= 0), key=lambda view: view.sent_at)
+                version, is_moving = view.version, now - view.moved_at < _REST_SECONDS
+            try:
+                self._draw(view, version, view.scale if is_moving else 1.0)
+            except Exception as error:  # one failed picture must not end the thread
+                view.drawn = (version, 1.0)
+                if self._open:
+                    self._on_error(error)
+
+    @staticmethod
+    def _wait(view: View, now: float) -> float:
+        """Seconds until a window is to be drawn; infinite where nothing is to be."""
+        version, size = view.drawn
+        if not all(view.size) or (version == view.version and size == 1.0):
+            return np.inf
+        if view.sent - view.shown >= _IN_FLIGHT:
+            return max(0.0, view.sent_at + _LOST_SECONDS - now)
+        return 0.0 if version != view.version else max(0.0, view.moved_at + _REST_SECONDS - now)
+
+    def _draw(self, view: View, version: int, scale: float) -> None:
+        orbit, (width, height) = self._artist.orbit(view), view.canvas
+        if orbit is None:
+            view.drawn = (version, 1.0)
+            return
+        start = time.monotonic()
+        small = max(_LEAST, round(scale * width)), max(_LEAST, round(scale * height))
+        pixels, over = self._artist.draw(view, orbit.camera(*small))
+        content = jpeg(pixels, _FULL_QUALITY if scale == 1.0 else _MOVING_QUALITY)
+        seconds = time.monotonic() - start
+        if scale < 1.0 or seconds < _BUDGET_SECONDS:
+            # half of the time does not depend on the size
+            view.scale = float(
+                np.clip(view.scale * np.clip((_BUDGET_SECONDS / seconds) ** 0.5, 0.7, 1.2), _SMALLEST, 1.0)
+            )
+        with self._wake:
+            view.sent += 1
+            view.sent_at = time.monotonic()
+            view.drawn = (version, scale)
+        head = {"n": view.sent, "full": scale == 1.0, "split": view.split, "seconds": round(seconds, 4), **over}
+        packed = json.dumps(head).encode()
+        view.window.send("picture", len(packed).to_bytes(4, "little") + packed + content)
+
+
+def jpeg(pixels: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
+    """A picture as JPEG, of a quality from 0 to 100."""
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "JPEG", quality=quality)
+    return stream.getvalue()
