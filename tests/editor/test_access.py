@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from editor_pages import TOKEN, Client, served
+from waiting import wait_until
 from websockets.exceptions import InvalidStatus
 
 from splatgraft.cli import main
@@ -62,7 +63,7 @@ def test_a_page_s_query_may_hold_the_token_alone() -> None:
     assert allowed_query("/") is None
     assert allowed_query("/?token=t") is None
     assert allowed_query("/?token=t&websocket=ws://evil.example") == "?token=t"
-    assert allowed_query("/?playbackPath=https://evil.example/a.viser") == "?"
+    assert allowed_query("/?page=https://evil.example/a.html") == "?"
 
 
 class Files:
@@ -124,6 +125,21 @@ def test_a_websocket_needs_the_page_s_origin_and_the_token() -> None:
         for wrong in ({"cookie": ""}, {"cookie": "splatgraft_token_1=secret"}, {"origin": "http://evil.example"}):
             with pytest.raises(InvalidStatus):
                 client.connect(**wrong)
+
+
+def test_what_a_window_sends_before_the_project_is_open_is_kept(tmp_path: Path) -> None:
+    got: list[dict[str, object]] = []
+
+    class Editor(Files):
+        def received(self, window: object, message: dict[str, object]) -> None:
+            got.append(message)
+
+    with served() as server, Client(server.port).connect() as connection:
+        connection.send("[1]")
+        connection.send('{"t": "size", "w": 640, "h": 480}')
+        wait_until(lambda: len(server._early) == 1, what="the message")
+        server.attach(Editor(tmp_path))
+        assert got == [{"t": "size", "w": 640, "h": 480}]
 
 
 def test_the_page_is_served_before_torch_is_loaded() -> None:

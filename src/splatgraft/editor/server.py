@@ -11,6 +11,7 @@ import json
 import socket
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -46,6 +47,9 @@ _MAX_MESSAGE_BYTES = 1 << 16  # a page's largest message is a path or a file's n
 _MAX_UPLOAD_BYTES = 1 << 30  # of one upload, which goes to the disk
 _MAX_WINDOWS = 16  # each is drawn for
 _MAX_UPLOADS = 4  # under way at once
+_MAX_EARLY = 64  # messages kept until a client is attached; a page sends two when it opens
+_NOT_OURS = (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError)
+"""Errors of a message that no page sends."""
 _START_SECONDS = 60  # limit against a hang
 
 
@@ -111,6 +115,8 @@ class Server:
         self._token = token
         self._client: Client | None = None
         self._windows: list[Window] = []
+        self._early: deque[tuple[Window, dict[str, Any]]] = deque(maxlen=_MAX_EARLY)
+        """Messages of windows that opened before a client was attached, such as the size of their canvas."""
         self._numbers = itertools.count(1)
         self._connections, self._uploads = 0, 0
         self._lock = threading.Lock()
@@ -139,6 +145,10 @@ class Server:
             self._client = client
             for window in self._windows:
                 client.opened(window)
+            for window, message in self._early:
+                if window in self._windows:
+                    _pass_on(client, window, message)
+            self._early.clear()
 
     def close(self) -> None:
         """Stop the server."""
@@ -234,13 +244,29 @@ class Server:
         if event["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(event.get("code", 1000))
         try:
-            message = json.loads(event.get("text") or "", parse_constant=_no_number)
-            if self._client is not None:
-                self._client.received(window, dict(message))
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-            # not the error's text, which may quote what was sent
-            found = f"one that is not ({type(error).__name__})"
-            sys.stderr.write(f"splatgraft: expected a message of the editor's own page, found {found}\n")
+            message = dict(json.loads(event.get("text") or "", parse_constant=_no_number))
+        except _NOT_OURS as error:
+            _say_foreign(error)
+            return
+        with self._lock:
+            client = self._client
+            if client is None:
+                self._early.append((window, message))
+        if client is not None:
+            _pass_on(client, window, message)
+
+
+def _pass_on(client: Client, window: Window, message: dict[str, Any]) -> None:
+    try:
+        client.received(window, message)
+    except _NOT_OURS as error:
+        _say_foreign(error)
+
+
+def _say_foreign(error: Exception) -> None:
+    # not the error's text, which may quote what was sent
+    found = f"one that is not ({type(error).__name__})"
+    sys.stderr.write(f"splatgraft: expected a message of the editor's own page, found {found}\n")
 
 
 class _Guard:
