@@ -78,6 +78,27 @@ def test_a_foot_of_the_table_s_colour_belongs_to_the_object():
     assert float(overlaps(masks, capture).mean()) > 0.95
 
 
+def test_a_flat_object_has_no_foot_and_a_click_decides_in_its_picture(plain):
+    selection, region = seed_selection(plain.scene, plain.cameras)
+    assert region.support is not None
+    flat = region.support.height(plain.scene.means).abs() < region.support.thickness
+    assert not bool(region.foot(plain.scene, flat.float()).any())
+
+    def nothing(image, lifted, prompt):
+        return torch.zeros_like(lifted)
+
+    views = CutViews(plain.images[:4], plain.cameras[:4], {1: ViewPrompt(outside=torch.tensor([[80.0, 60.0]]))})
+    seen = []
+
+    def first_whole(image, lifted, prompt):
+        seen.append(prompt)
+        return (lifted > 0.5).float() if len(seen) <= 4 else nothing(image, lifted, prompt)
+
+    masks, _ = cut_object(views, plain.scene, share=selection, region=region, cutter=first_whole)
+    # by a cutter that finds nothing in the second round, masks hold the foot alone, but where the user clicked
+    assert [bool(mask.any()) for mask in masks] == [True, False, True, True]
+
+
 def test_what_hangs_on_a_wall_is_cut_without_the_wall():
     capture = object_capture("on_a_wall")
     assert float(overlaps(cut(capture)[0], capture).mean()) > 0.9

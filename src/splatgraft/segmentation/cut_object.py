@@ -121,7 +121,8 @@ def cut_object(
             # without a visible selection or click, the mask is empty
             shows = int((lifted > 0.5).sum()) >= _MIN_PIXELS or len(prompt.inside)
             cut = cutter(views.images[index], lifted, prompt) if shows else torch.zeros_like(lifted)
-            made[index] = torch.where(is_foot > 0.5, 1.0, cut)
+            # in a picture with the user's points or rectangle, these decide
+            made[index] = cut if index in views.prompts else torch.where(is_foot > 0.5, 1.0, cut)
             total += weight_inside(operator, made[index].to(scene.device))
         return made, share_inside(total) * may_be
 

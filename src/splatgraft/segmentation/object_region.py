@@ -109,11 +109,14 @@ class ObjectRegion:
             return torch.zeros_like(opaque)
         is_low = (heights > _ABOVE_SUPPORT * self.support.thickness) & (heights < low + _FOOT * (high - low))
         end = scene.means[chosen & is_low]
+        if not len(end):  # a flat object has no foot
+            return torch.zeros_like(opaque)
         turns = torch.arange(_FOOT_SIDES).to(heights) * 2 * math.pi / _FOOT_SIDES
         tangent, bitangent = tangents(self.support.normal.to(scene.means))
         sides = turns.cos()[:, None] * tangent + turns.sin()[:, None] * bitangent
         middle = end.median(0).values
-        widths = ((end - middle) @ sides.T).quantile(1 - _FOOT_TRIM, dim=0)
+        rank = math.ceil((1 - _FOOT_TRIM) * len(end))  # not torch.quantile, which takes 16 million numbers at most
+        widths = ((end - middle) @ sides.T).kthvalue(rank, dim=0).values
         within = ((scene.means - middle) @ sides.T < _FOOT_WIDTH * widths).all(1)
         return opaque & within & is_low
 

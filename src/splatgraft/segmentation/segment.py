@@ -1,6 +1,6 @@
 """Segmentation of a scene into an object and its surroundings, by the object masks of the scene's capture."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -68,7 +68,8 @@ def segment(
     chosen = scene.select(selection)
     if solidify is not None and solidify.iterations:
         photographs = LazySequence(len(masked), lambda index: (masked.image(index), masks[index]))
-        chosen = solidify_object(scene, selection, cameras, photographs, options=solidify, progress=progress)
+        options = replace(solidify, threshold=select.threshold)
+        chosen = solidify_object(scene, selection, cameras, photographs, options=options, progress=progress)
     closed = close_unseen_side(chosen, cameras, masks)
     return Segmentation(
         closed.gaussians.to(scene.device), scene.select(~selection), selection, feature, closed.is_guessed

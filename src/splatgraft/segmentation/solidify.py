@@ -7,7 +7,7 @@ and Gaussians of this fit belong to the object, so a draft of the capture is eno
 1. Each view is cropped to the object. Pixels in which something else hides the object are not compared.
 2. The object is fitted. If it has few Gaussians for its size in the photographs, Gaussians are split as in a
    reconstruction.
-3. Gaussians outside more than a third of the masks are removed.
+3. Gaussians that lie inside too few masks are removed.
 4. Gaussians that hardly show in any view take the mean colour of their neighbours.
 
 All constants are set by hand.
@@ -28,12 +28,12 @@ from splatgraft.fitting.gaussian_fit import FitOptions, LearningRates, View, fit
 from splatgraft.fitting.surface_loss import SurfaceLoss
 from splatgraft.rendering import RenderOptions, render, view_operator
 from splatgraft.runtime.progress import Progress, silent
+from splatgraft.segmentation.selection import SelectOptions
 
 _DENSIFICATIONS = 20  # number of densifications
 _FULL_AT, _STOP_AT = 0.6, 0.7  # shares of the steps at which the number is reached, and after which density is fixed
 _STRIDE = 2  # distance of the fitted pixels along each axis
 _HIDDEN = 0.1  # visible pixels over a Gaussian's own area, relative to the median, below which its colour is unknown
-_IN_MASKS = 0.75  # smallest share of the masks that contain a Gaussian: that of the selection
 _NEIGHBOURS = 8  # Gaussians of known colour whose mean replaces an unknown one
 _RATES = LearningRates(
     means=1.6e-3,
@@ -61,6 +61,8 @@ class SolidifyOptions:
     """Pixels of the object in the median view per Gaussian after splitting; 0 splits none."""
     budget: int = 50_000
     """Largest number of Gaussians after splitting."""
+    threshold: float = SelectOptions.threshold
+    """Minimum share of the masks that contain a Gaussian; others are removed after the fit."""
     view_gains: Sequence[float] | None = None
     """Brightness of each photo over their mean if exposure or white balance differ; colour maps of the photos are then
     fitted and stay out of the object. None fits no maps."""
@@ -139,11 +141,12 @@ def solidify_object(
         control=None if options.pixels_per_gaussian == 0 else _density(chosen, views, cameras, options).update,
         progress=lambda done, total, text: progress(done, total, f"making the object solid, {text}"),
     )
-    return _with_known_colors(fitted.select(_in_most_masks(fitted, cameras[torch.tensor(used)], views)), views)
+    share = _share_of_masks(fitted, cameras[torch.tensor(used)], views)
+    return _with_known_colors(fitted.select(share >= options.threshold), views)
 
 
-def _in_most_masks(gaussians: Gaussians, cameras: Cameras, views: Sequence[View]) -> Bool[Tensor, "n"]:
-    """Test which centres lie inside most masks of the photographs that frame them and in which nothing hides them.
+def _share_of_masks(gaussians: Gaussians, cameras: Cameras, views: Sequence[View]) -> Float[Tensor, "n"]:
+    """Compute the share of masks that contain each centre, of those that frame it and in which nothing hides it.
 
     A few wrong masks that contain the same part of the background would leave it on the object as a strand.
 
@@ -166,7 +169,7 @@ def _in_most_masks(gaussians: Gaussians, cameras: Cameras, views: Sequence[View]
         is_hidden = torch.zeros_like(is_framed) if view.is_compared is None else ~view.is_compared[..., 0][at]
         inside += is_framed & is_inside
         outside += is_framed & ~is_inside & (is_cropped | ~is_hidden)
-    return inside >= _IN_MASKS * (inside + outside)
+    return torch.where(inside + outside > 0, inside / (inside + outside).clamp_min(1), 1.0)
 
 
 def _density(chosen: Gaussians, views: Sequence[View], cameras: Cameras, options: SolidifyOptions) -> DensityControl:

@@ -137,10 +137,10 @@ class Segment:
         on_device = scene.to(device)
         box = None if self.box is None else Box(torch.tensor(self.box[:3]), torch.tensor(self.box[3:]))
         capture = read_capture(self.capture)
-        masked, feature, keep = None, None, self.keep
-        if self._source(capture) == "whole":
+        masked, feature, keep, source = None, None, self.keep, self._source(capture)
+        if source == "whole":
             feature, keep = torch.ones(scene.count), "all"
-        elif self._source(capture) == "box":
+        elif source == "box":
             if box is None:
                 raise ValueError("--mask-source box: expected --box beside it, found none")
             feature = box.contains(scene.means).float()
@@ -162,7 +162,8 @@ class Segment:
         chosen = scene.select(selection)
         if self.solidify and masked is not None:
             views, photographs = _photographs(masked)
-            options = SolidifyOptions(self.solidify, view_gains=read_view_gains(views.image_paths))
+            gains = read_view_gains(views.image_paths)
+            options = SolidifyOptions(self.solidify, threshold=self.threshold, view_gains=gains)
             cameras = views.cameras.to(device)
             chosen = solidify_object(
                 on_device, selection.to(device), cameras, photographs, options=options, progress=context.progress
