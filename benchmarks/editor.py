@@ -30,7 +30,7 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.formats import write_gaussians
 from splatgraft.project.toml_edit import with_keys
 
-WIDTH, HEIGHT, SECONDS, HANG_LIMIT = 1280, 720, 4.0, 900.0
+WIDTH, HEIGHT, SECONDS, REST, HANG_LIMIT = 1280, 720, 4.0, 5.0, 900.0
 BALL_BOX = [-0.35, -0.35, 0.02, 0.35, 0.35, 0.75]
 
 
@@ -130,9 +130,10 @@ def measure(project: Path) -> dict[str, float]:
         client.listen(1.0)
         found["orbit, pictures a second"] = moved(client, lambda at: client.send("turn", x=0.004, y=0.0))
         found["full picture after it"] = client.until(lambda head: head["full"], after=len(client.heads))
-        # the first move needs all layers; later ones are the rule
+        # the first move needs all layers; later ones are the rule, after the editor has prepared their drafts
         for name in ("first ", ""):
             drag(client, found, name)
+            client.listen(REST)
         client.close()
     return found
 

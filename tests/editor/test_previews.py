@@ -8,23 +8,27 @@ from unittest.mock import MagicMock
 import pytest
 import torch
 from editor_pages import cloud
+from shapes import ring, sunlit_scene, surfels
 from test_state import LIGHT, moved
 from tiny_project import copy_of
 
 from splatgraft.cli import main
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.composition import compose
+from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor import relit_preview
+from splatgraft.editor import relit_preview, transfer_values
 from splatgraft.editor.light_process import Lit
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import CoarseGaussians, RelitPreview, coarsen, upsample_light
 from splatgraft.editor.session import Session
+from splatgraft.editor.transfer_values import TransferValues
 from splatgraft.formats import read_gaussians
 from splatgraft.project.toml_edit import with_keys
-from splatgraft.relighting import LayerWeights, Light
+from splatgraft.relighting import LayerWeights, Light, RelightOptions, SourceScene
 from splatgraft.relighting.layers import pasted
 
 
@@ -218,3 +222,26 @@ def test_what_drafts_share_is_computed_before_the_first_move(project: Path, monk
         session.undo()
     assert torch.equal(drafts[0].shadow, drafts[1].shadow)
     assert torch.equal(drafts[0].shade, drafts[1].shade)
+
+
+@pytest.mark.long
+def test_a_draft_takes_the_light_at_the_old_place_from_the_full_transfer(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimated = MagicMock(side_effect=transfer_values.find_source_light)
+    monkeypatch.setattr(transfer_values, "find_source_light", estimated)
+    floor = sunlit_scene(torch.tensor([0.6, 0.0, 0.8]), 3.0)
+    around = even_directions(200)
+    ball = surfels(0.2 * around + torch.tensor([0.0, 0.0, 0.2]), around, width=0.03)
+    cameras = ring(6)
+    transfers = [TransferValues(lambda: None) for _ in range(2)]
+    fewer = floor.select(torch.arange(0, floor.count, 2)), ball.select(torch.arange(100))
+    pairs = [(part, SourceScene(scene, cameras)) for scene, part in ((floor, ball), fewer)]
+    transfers[1].share_source_light(pairs[1], transfers[0], pairs[0])  # nothing is there yet
+    for (part, source), values in zip(pairs, transfers, strict=True):
+        composite = Composite(
+            floor, (PlacedObject(part, Similarity.identity()),), torch.zeros(floor.count, dtype=torch.bool)
+        )
+        values.relight(
+            composite, cameras, sources=[source], light=LIGHT, options=RelightOptions(fitted_views=0), exact=False
+        )
+        transfers[1].share_source_light(pairs[1], transfers[0], pairs[0])
+    assert estimated.call_count == 1

@@ -169,7 +169,7 @@ class RelitPreview:
         )
 
     def _draft(self, state: EditState) -> Relit:
-        composite, sources = self._scenes.composite(state), self._scenes.source_scenes(state)
+        composite, sources = self._scenes.composite(state), list(self._scenes.source_scenes(state))
         if not self._memo.has("relit"):
             # analysing the source scene takes half of the time of the first result
             sources = [None] * len(sources)
@@ -177,12 +177,18 @@ class RelitPreview:
         if _is_large(composite):
             kept = (composite.target, composite.erased)
             target = memo.get("coarse target", kept, lambda: coarsen(kept[0].select(~kept[1]), TARGET_BUDGET))
+            # duplicates of an object share its coarse Gaussians, and so the light at its old place
+            given = [one.gaussians for one in composite.objects]
+            first = [next(i for i, other in enumerate(given) if other is one) for one in given]
             objects = [
-                memo.get(f"coarse object {i}", (one.gaussians,), lambda one=one: coarsen(one.gaussians, OBJECT_BUDGET))
-                for i, one in enumerate(composite.objects)
+                memo.get(f"coarse object {i}", (given[i],), lambda i=i: coarsen(given[i], OBJECT_BUDGET)) for i in first
             ]
-            sources = [None if source is None else self._coarse_source(source) for source in sources]
             values, parts, coarse = self._draft_values, [target, *objects], target.gaussians
+            for i, source in enumerate(sources):
+                if source is not None:
+                    sources[i] = small = self._coarse_source(source)
+                    pair = (objects[i].gaussians, small)
+                    values.share_source_light(pair, self._full_values, (given[i], source))
             drawn = Composite(
                 target=coarse,
                 objects=tuple(

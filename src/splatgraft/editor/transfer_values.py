@@ -9,6 +9,7 @@ from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.bounds import bounding_sphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.clock_sun import ClockSun
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.memo import Memo
 from splatgraft.relighting import Light, RelightOptions, Relit, SourceScene
 from splatgraft.relighting.captured_scene import CapturedScene
@@ -17,6 +18,8 @@ from splatgraft.relighting.layers import assemble_layers, pasted
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.prepared_object import PreparedObject, find_source_light, prepare_object
 from splatgraft.relighting.scene_light import SceneLight, find_scene_light
+
+_SOURCE_LIGHT = "source light"  # name in the memo
 
 
 class TransferValues:
@@ -54,6 +57,20 @@ class TransferValues:
         views, budget = cameras.spread(options.fitted_views), options.budget(merged.count)
         shadows = cast_shadows(scene, objects, merged.select(~is_object), views=views, budget=budget)
         return assemble_layers(merged, scene, objects, shadows)
+
+    def share_source_light(
+        self, pair: tuple[Gaussians, SourceScene], other: "TransferValues", theirs: tuple[Gaussians, SourceScene]
+    ) -> None:
+        """Take the light at an object's old place that other values hold, instead of estimating it again.
+
+        Args:
+            pair: The object and its source scene here, for example with fewer Gaussians.
+            other: The values that may hold the light.
+            theirs: The same object and source scene there.
+        """
+        light = other._memo.peek(_SOURCE_LIGHT, theirs)
+        if light is not None:
+            self._memo.put(_SOURCE_LIGHT, pair, light)
 
     def _scene_light(
         self, composite: Composite, cameras: Cameras, light: Light | None, options: RelightOptions, *, exact: bool
@@ -94,7 +111,7 @@ class TransferValues:
         if source is not None:
             # one for all: only the project's own object has a source, and its duplicates share it
             pair = (placed.gaussians, source)
-            source_light = self._memo.get("source light", pair, lambda: find_source_light(*pair))
+            source_light = self._memo.get(_SOURCE_LIGHT, pair, lambda: find_source_light(*pair))
         prepared = prepare_object(
             placed, source, scene.captured.cameras, source_light=source_light, light=scene.light, number=number
         )
