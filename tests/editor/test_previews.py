@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from queue import Queue
 from unittest.mock import MagicMock
 
 import pytest
@@ -20,11 +21,12 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor import relit_preview, transfer_values
-from splatgraft.editor.light_process import Lit
+from splatgraft.editor.light_process import LightProcess, Lit
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import CoarseGaussians, RelitPreview, coarsen, upsample_light
 from splatgraft.editor.session import Session
+from splatgraft.editor.state import EditState
 from splatgraft.editor.transfer_values import TransferValues
 from splatgraft.formats import read_gaussians
 from splatgraft.project.toml_edit import with_keys
@@ -155,6 +157,33 @@ def test_the_preview_of_a_photograph_is_unchanged(session: Session, tmp_path: Pa
     photo = Pictures(session.scenes).draw("photo", session.placed_state(), camera, 0)
     stored = read_rgb(session.files.root.parent / "photos" / "target" / "images" / camera.names[0])
     assert torch.equal(torch.from_numpy(photo), (stored * 255).round().to(torch.uint8))
+
+
+def test_the_light_process_makes_drafts_of_what_is_asked_last(session: Session) -> None:
+    answers: Queue[tuple[EditState, Lit]] = Queue()
+    errors = MagicMock()
+    process = LightProcess(Project(session.files.file), lambda state, lit: answers.put((state, lit)), errors)
+    try:
+        state = session.placed_state()
+        process.want(state, "prepared")
+        places = [moved(state) for _ in range(4)]
+        for place in places:
+            process.want(place, "draft")
+        shown, lit = answers.get(timeout=120)
+        assert shown is places[-1]  # none of the places that were left, and nothing for what was only prepared
+        assert lit.stage == "draft"
+        assert lit.relit.gaussians.count == 0
+        expected = RelitPreview(session.scenes).draft(shown)
+        scenes = Pictures(session.scenes).lit
+        scenes.add(shown, lit)
+        drawn = scenes.scene(shown)
+        assert torch.equal(drawn.means, expected.bake(shown.weights)[0].means)
+        process.want(shown, "final")
+        stages = [answers.get(timeout=120)[1].stage for _ in range(2)]
+        assert stages[-1] == "final"
+    finally:
+        process.close()
+    errors.assert_not_called()
 
 
 def test_a_small_scene_is_not_reduced() -> None:

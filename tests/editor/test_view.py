@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -15,8 +16,10 @@ from shapes import blobs
 from test_state import LIGHT
 
 from splatgraft.cli import main
+from splatgraft.composition import Support
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.rotations import rotation_about
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.drag import Drag, DragMode, outline
 from splatgraft.editor.editor import Editor
@@ -68,6 +71,19 @@ def test_a_moved_object_follows_the_pointer_on_its_support(session: Session) -> 
         again = at(drag, "move", 0.5 + dx, 0.5 + dy)
         assert torch.allclose(again.translation, placed.translation, atol=1e-6)
     assert at(drag, "turn", 0.5, 0.4).scale == drag.placed.scale
+
+
+def test_a_dragged_object_follows_a_slope_and_not_the_noise_of_its_support(session: Session) -> None:
+    drag, angles = grabbed(session), [0.0, 0.5, 1.0, 4.0, 4.5]
+    found = []
+    for angle in angles:
+        normal = rotation_about(torch.tensor([0.0, 1.0, 0.0]), math.radians(angle)).float() @ drag.placed.rotation
+        support = Support(torch.zeros(3), normal @ drag.item.base.up, flat_fraction=1.0, obstructed_fraction=0.0)
+        with patch("splatgraft.editor.drag.support_below", return_value=support):
+            found.append(drag.at("move", (0.5, 0.5), (0.5, 0.5), anywhere=True).rotation @ drag.item.base.up)
+    tilts = [math.degrees(math.acos(min(1.0, float(up @ found[0])))) for up in found]
+    assert max(tilts[:3]) < 0.02
+    assert tilts[3:] == pytest.approx([4.0, 4.0], abs=0.05)
 
 
 def test_a_moved_object_stops_at_the_edge_of_its_support(session: Session) -> None:

@@ -34,6 +34,8 @@ _ALIKE = 0.85  # of the share where the drag began: an object on rough ground ca
 _STEP = 0.5  # largest change of height in a drag over the object's height, unless another support is wanted
 _NEAR = 0.5  # height above the support over the object's within which an object stands on it
 _STRAIGHT = math.cos(math.radians(10.0))  # an object that is tilted more against its support keeps its tilt
+_EVEN = math.cos(math.radians(1.5))  # an object follows larger tilts of its support; every turn makes drafts slow
+_NEAR_RADII = 10  # half the side of the box of Gaussians among which supports are searched, over the foot's radius
 _HALVINGS = 5  # of the way to a place where the object cannot stand: 3% of it
 _HULL_POINTS = 400  # points of an object that its outline is made of
 _MIN_SIN = 0.05  # sine of the angle between a ray and the horizontal, below which they do not meet
@@ -54,6 +56,7 @@ class Drag:
         self._depth = torch.where(found.alpha[0] > 0.5, found.depth[0], 0.0)
         self._foot = placed.points(item.base.point)
         self._last = self._foot
+        self._near: tuple[Tensor, Gaussians] | None = None
         support = self._support(self._foot)
         above = math.inf if support is None else float((self._foot - support.point) @ self._up)
         self._stands = abs(above) < _NEAR * placed.scale * item.base.height
@@ -99,8 +102,8 @@ class Drag:
         height = self.placed.scale * self.item.base.height
         if not anywhere and abs(float((support.point - self._foot) @ self._up)) > _STEP * height:
             return None
-        rotation = self.placed.rotation
-        if self._is_straight:
+        rotation = self._best.rotation
+        if self._is_straight and float(rotation @ self.item.base.up @ support.normal) < _EVEN:
             rotation = (rotation_between(rotation @ self.item.base.up, support.normal) @ rotation).float()
         translation = support.point - self.placed.scale * rotation @ self.item.base.point
         return Similarity(scale=self.placed.scale, rotation=rotation, translation=translation.float())
@@ -108,9 +111,11 @@ class Drag:
     def _support(self, foot: Float[Tensor, "3"]) -> Support | None:
         radius, height = self.placed.scale * self.item.base.radius, self.placed.scale * self.item.base.height
         # only what lies around matters, and drawing it is fast
-        near = (self._place.means - foot).abs().amax(1) < 8 * radius + height
+        if self._near is None or float((self._near[0] - foot).abs().max()) > 2 * radius:
+            near = (self._place.means - foot).abs().amax(1) < _NEAR_RADII * radius + height
+            self._near = foot, self._place.select(near)
         try:
-            return support_below(self._place.select(near), foot + 0.5 * height * self._up, up=self._up, radius=radius)
+            return support_below(self._near[1], foot + 0.5 * height * self._up, up=self._up, radius=radius)
         except ValueError:
             return None  # nothing lies below
 

@@ -49,6 +49,7 @@ KINDS: dict[str, Kind] = {
 """Kinds of pictures of the target, by the name that a user chooses."""
 _POLL_SECONDS = 0.4
 _MARK_SECONDS = 1.0  # how long nothing must change before the steps are marked anew
+_DRAWN_SECONDS = 0.3  # that the next move of a drag waits for the picture of the last one
 _CURRENT, _DONE, _STALE, _NEXT = "●", "✓", "↻", "›"
 _WORDS = {"do": "id", "live": "id", "key": "key", "step": "to"}
 """Kinds of messages about the panel, with the field that names something."""
@@ -340,9 +341,13 @@ class Editor:
         if not state.objects:
             return
         stage = pictures.lit.stage(state)
-        if stage == "final" or (stage == "file" and self.step != "Light"):
+        if stage == "final":
             return
-        self._light.want(state, final=self.live is None)
+        if self.live is not None:
+            if self._moves is None:  # the pointer rests
+                self._light.want(state, "draft")
+        else:
+            self._light.want(state, "prepared" if stage == "file" and self.step != "Light" else "final")
 
     def _lit(self, state: EditState, lit: Lit) -> None:
         if self.pictures is not None and self._is_open:
@@ -447,12 +452,16 @@ class Editor:
     def _act(self) -> None:
         while (action := self._actions.get()) is not None:
             window, message = action
-            if message["t"] == "pointer" and message["what"] == "move":
+            is_move = message["t"] == "pointer" and message["what"] == "move"
+            if is_move:
                 message, self._moves = self._moves or message, None
             with self.lock:
                 view = self.editing()
                 if view is not None and view.window is window:
                     self._take_action(view, message)
+            if is_move and view is not None:
+                # places that no picture shows would only delay those that one does
+                self.stream.wait_drawn(view, _DRAWN_SECONDS)
 
     def _take_action(self, view: View, message: dict[str, Any]) -> None:
         is_move = message["t"] == "live" or (message["t"] == "pointer" and message["what"] == "move")

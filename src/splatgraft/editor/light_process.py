@@ -14,21 +14,26 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any, Literal, get_args
+
+import torch
 
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import RelitPreview
 from splatgraft.editor.scene_cache import SceneCache
+from splatgraft.editor.session import stamps_of
 from splatgraft.editor.state import EditState
 from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.relighting import Relit
 
 Stage = Literal["draft", "refined", "final"]
+Wanted = Literal["prepared", "draft", "final"]
+"""What is asked for: that drafts are prepared while nothing else is to be done, a draft, or a draft and the light."""
 _START = "import sys; from splatgraft.editor import light_process; light_process.main(sys.argv[1:])"
 """What the process runs; a module that is run by its name would answer with classes that the editor does not know."""
 _FIELDS = ("objects", "erased", "light")
 """What the light depends on in an `EditState`."""
-_SETTLE_SECONDS = 0.2  # how long nothing must change before the light itself is begun, which cannot be interrupted
+_SETTLE_SECONDS = 0.25  # time without a change before the light, or a draft during a drag, is begun
 _REMEMBERED = 500  # states that were asked for; in a drag each picture asks for one, and a draft may take long
 _NICE = 5  # priority below that of pictures
 
@@ -40,7 +45,7 @@ class Lit:
     stage: Stage
     """A draft, all layers under the sources found before a move, or the step's own result."""
     relit: Relit
-    """The layers."""
+    """The layers; those of a draft come without their Gaussians, which are those of the composite."""
     seconds: float
     """How long they took."""
 
@@ -56,15 +61,17 @@ class LightProcess:
         self._child: subprocess.Popen[bytes] | None = None
         self._sent: dict[str, Any] = {}
         self._asked: dict[int, EditState] = {}
-        self._number, self._wanted = 0, ""
+        self._number = 0
+        self._wanted: Wanted | None = None
         self._lock = threading.Lock()
 
-    def want(self, state: EditState, *, final: bool) -> None:
+    def want(self, state: EditState, wanted: Wanted) -> None:
         """Ask for the light of a state, in place of what was asked before; nothing where it was asked for already."""
         with self._lock:
             latest = self._asked.get(self._number)
             is_same = latest is not None and all(getattr(latest, name) is getattr(state, name) for name in _FIELDS)
-            if is_same and (self._wanted == "final" or not final):
+            order = get_args(Wanted)
+            if is_same and self._wanted is not None and order.index(self._wanted) >= order.index(wanted):
                 return
             if self._child is None or self._child.poll() is not None:
                 self._start()
@@ -74,13 +81,13 @@ class LightProcess:
             changed = {
                 name: getattr(state, name) for name in _FIELDS if self._sent.get(name, self) is not getattr(state, name)
             }
-            self._number, self._wanted = self._number + 1, "final" if final else "draft"
+            self._number, self._wanted = self._number + 1, wanted
             self._asked = {
                 number: asked for number, asked in self._asked.items() if number > self._number - _REMEMBERED
             }
             self._asked[self._number] = state
             try:
-                _write(self._child.stdin, (self._number, changed, final))
+                _write(self._child.stdin, (self._number, changed, wanted))
                 self._sent |= changed
             except OSError:
                 self._child.kill()
@@ -119,13 +126,14 @@ class LightProcess:
         with self._lock:
             if child is self._child:
                 # what it was asked last is asked again
-                self._asked, self._wanted = {}, ""
+                self._asked, self._wanted = {}, None
 
 
 class _Computing:
     """The other side: two threads, so that a draft does not wait for the light of an earlier state."""
 
     def __init__(self, project: Project, out: IO[bytes]) -> None:
+        self._stamps = stamps_of(project.file)
         files = project.files()
         assert files is not None
         self._project, self._out = project, out
@@ -136,22 +144,30 @@ class _Computing:
         self._lights = LatestOnlyWorker(self._light, self._failed)
         self._number, self._state = 0, EditState()
 
-    def take(self, number: int, changed: dict[str, Any], final: bool) -> None:
-        files = self._project.files()
-        if files is not None:
-            self._scenes.files = files
+    def take(self, number: int, changed: dict[str, Any], wanted: Wanted) -> None:
+        stamps = stamps_of(self._project.file)
+        if stamps != self._stamps:
+            files, self._stamps = self._project.files(), stamps
+            if files is not None:
+                self._scenes.files = files
         self._number, self._state = number, replace(self._state, **changed)
-        self._drafts.submit((number, self._state, final))
+        self._drafts.submit((number, self._state, wanted))
 
-    def _draft(self, asked: tuple[int, EditState, bool]) -> None:
-        number, state, final = asked
+    def _draft(self, asked: tuple[int, EditState, Wanted]) -> None:
+        number, state, wanted = asked
+        # the layers of a place that a drag has left would only delay the pictures and the next draft
+        if wanted != "final" and not self._drafts.wait_idle(_SETTLE_SECONDS):
+            return
+        if wanted == "prepared":
+            self._relighting.prepare_drafts(state)
+            return
         start = time.monotonic()
         if self._scenes.files.transfers_light and not self._relighting.is_relit(state):
             self._send(number, "draft", self._relighting.draft(state), start)
-        if final:
+        if wanted == "final":
             self._lights.submit(asked)
 
-    def _light(self, asked: tuple[int, EditState, bool]) -> None:
+    def _light(self, asked: tuple[int, EditState, Wanted]) -> None:
         number, state, _ = asked
         if not self._lights.wait_idle(_SETTLE_SECONDS) or number != self._number:
             return
@@ -165,8 +181,10 @@ class _Computing:
             self._relighting.prepare_drafts(state)
 
     def _send(self, number: int, stage: Stage, relit: Relit, start: float) -> None:
-        # what only the step writes stays here
+        # what only the step writes stays here; the Gaussians of a draft, none of which is split, the editor has
         shown = replace(relit, estimate=None, received=(), prepared=())
+        if stage == "draft":
+            shown = replace(shown, gaussians=shown.gaussians.select(torch.zeros(0, dtype=torch.int64)))
         with self._lock:
             _write(self._out, (number, Lit(stage, shown, time.monotonic() - start)))
 

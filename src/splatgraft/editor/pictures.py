@@ -38,10 +38,8 @@ Kind = Literal["lit", "pasted", "result", "place", "shadow", "photo"]
 TINT = (1.0, 0.45, 0.1)
 """sRGB color of what is selected."""
 _LONGEST_PX = 1920  # of a photo on the canvas; on a larger canvas the browser enlarges it
-_DARKEST, _SHADOW_WIDTH = (
-    0.5,
-    0.35,
-)  # of a contact shadow: share of the light that it takes; its width over the object's radius
+_DARKEST = 0.5  # share of the light that a contact shadow takes
+_SHADOW_WIDTH = 0.35  # of a contact shadow over the object's radius
 _NO_TURN = 1e-5  # largest entry of a rotation over the identity's that rounding makes
 _FOOT_SHARE, _FOOT_POINTS = 0.2, 200  # part of an object's height that counts as its foot; its points
 
@@ -95,7 +93,10 @@ class LitScenes:
                 return
             if now is not None and now.stage == "file" and now.fits(state) and lit.stage != "final":
                 return  # the finished result stays
-            self._now = _LitState(state, lit.stage, lit.relit)
+            relit = lit.relit
+            if len(relit.is_object) != relit.gaussians.count:
+                relit = replace(relit, gaussians=self._scenes.composite(state).merged()[0])
+            self._now = _LitState(state, lit.stage, relit)
 
     def adopt(self, state: EditState) -> None:
         """Take the result of the step `relight`, which is up to date for a state."""

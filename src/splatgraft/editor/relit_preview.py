@@ -133,12 +133,12 @@ class RelitPreview:
         return self._make_once("draft", state, lambda: self._draft(state), lock=lock)
 
     def prepare_drafts(self, state: EditState) -> None:
-        """Compute once what drafts after a move share, which the first draft left out: what lights the source scene."""
+        """Compute once what later drafts share, with the light of the source scene, which the first draft omits."""
         composite, sources = self._scenes.composite(state), self._scenes.source_scenes(state)
-        if _is_large(composite) and self._memo.has("relit"):
-            with self._draft_lock:
+        if self._scenes.files.transfers_light and (_is_large(composite) or not self._memo.has("relit")):
+            with self._draft_lock if _is_large(composite) else self._full_lock:
                 shared = (composite.target, composite.erased, *sources)
-                self._memo.get("drafts prepared", shared, lambda: self._draft(state))
+                self._memo.get("drafts prepared", shared, lambda: self._draft(state, with_sources=True))
 
     def layers(self, state: EditState, *, draft: bool) -> Relit:
         """The layers of the light transfer, or the best draft of them."""
@@ -168,9 +168,10 @@ class RelitPreview:
             exact=exact,
         )
 
-    def _draft(self, state: EditState) -> Relit:
-        composite, sources = self._scenes.composite(state), list(self._scenes.source_scenes(state))
-        if not self._memo.has("relit"):
+    def _draft(self, state: EditState, *, with_sources: bool = False) -> Relit:
+        composite = self._scenes.composite(state)
+        sources: list[SourceScene | None] = list(self._scenes.source_scenes(state))
+        if not (with_sources or self._memo.has("relit") or self._memo.has("drafts prepared")):
             # analysing the source scene takes half of the time of the first result
             sources = [None] * len(sources)
         values, drawn, parts, memo = self._full_values, composite, [], self._memo

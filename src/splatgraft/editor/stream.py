@@ -99,7 +99,7 @@ class Stream:
         """Draw for a window from now on."""
         with self._wake:
             self.views.append(view)
-            self._wake.notify()
+            self._wake.notify_all()
 
     def remove(self, window: Window) -> None:
         """Draw for a window no more."""
@@ -115,19 +115,25 @@ class Stream:
         with self._wake:
             for one in self.views if view is None else [view]:
                 one.touched(moving=moving)
-            self._wake.notify()
+            self._wake.notify_all()
+
+    def wait_drawn(self, view: View, seconds: float) -> None:
+        """Wait until a picture of what a window shows now is drawn, at most `seconds`."""
+        with self._wake:
+            version = view.version
+            self._wake.wait_for(lambda: view.drawn[0] >= version or not self._open, timeout=seconds)
 
     def acknowledge(self, view: View, number: int) -> None:
         """A window has shown a picture."""
         with self._wake:
             view.shown = max(view.shown, min(number, view.sent))
-            self._wake.notify()
+            self._wake.notify_all()
 
     def close(self) -> None:
         """End the thread after the picture that it draws."""
         with self._wake:
             self._open = False
-            self._wake.notify()
+            self._wake.notify_all()
         self._thread.join(timeout=1.0)
 
     def _run(self) -> None:
@@ -180,6 +186,7 @@ class Stream:
             view.sent += 1
             view.sent_at = time.monotonic()
             view.drawn = (version, scale)
+            self._wake.notify_all()
         head = {"n": view.sent, "full": scale == 1.0, "split": view.split, "seconds": round(seconds, 4), **over}
         packed = json.dumps(head).encode()
         view.window.send("picture", len(packed).to_bytes(4, "little") + packed + content)

@@ -11,6 +11,7 @@ from splatgraft.runtime.kernels import kernel
 
 TILE = 16
 _DIGIT_BITS = 11
+_CHUNKS = 8  # parts of the splats that are listed side by side
 
 
 @kernel
@@ -75,18 +76,84 @@ def _tile_rows(splat, tiles_y):
     return int(max(min(top, 1e6), 0.0)), int(max(min(bottom + 1.0, float(tiles_y)), 0.0))
 
 
+@kernel
+@no_type_check
+def _tile_columns(splat, tiles_x):
+    """Compute the first and one past the last tile column that the ellipse can meet."""
+    left = (splat[MX] - splat[REACH_X] - 1e-3) / TILE
+    right = (splat[MX] + splat[REACH_X] + 1e-3) / TILE
+    return int(max(min(left, 1e6), 0.0)), int(max(min(right + 1.0, float(tiles_x)), 0.0))
+
+
 @kernel(parallel=True)
 @no_type_check
-def _spans(packed, first_row, tiles_x, tiles_y):
-    """Compute the tiles of every splat, row by row, as first and one past the last; its rows begin at `first_row`."""
-    spans = np.empty((first_row[-1], 2), np.int32)
-    for s in prange(packed.shape[0]):
-        top, bottom = _tile_rows(packed[s], tiles_y)
-        for row in range(top, bottom):
-            left, right = _tile_span(packed[s], row, tiles_x)
-            place = first_row[s] + row - top
-            spans[place, 0], spans[place, 1] = left, max(left, right)
-    return spans
+def _pack(splats, order, tiles_y, packed, row_counts):
+    """Fill `packed (m, 8)` with the splats by `order`, and `row_counts (m,)` with how many tile rows each meets."""
+    m = order.shape[0]
+    for chunk in prange(_CHUNKS):
+        for s in range(m * chunk // _CHUNKS, m * (chunk + 1) // _CHUNKS):
+            g = order[s]
+            for column in range(COLUMNS):
+                packed[s, column] = splats[g, column]
+            top, bottom = _tile_rows(packed[s], tiles_y)
+            row_counts[s] = max(bottom - top, 0)
+
+
+@kernel(parallel=True)
+@no_type_check
+def _count(packed, first_row, tiles_x, tiles_y, spans, listed, counts):
+    """Compute the tiles of every splat, and count the splats of every tile.
+
+    Args:
+        packed: (m, 8) splats.
+        first_row: (m + 1,) begin of each splat's rows in `spans`.
+        spans: (r, 2) filled with the first and one past the last tile of each tile row that a splat meets.
+        listed: (m,) filled with each splat's number of tiles.
+        counts: (chunks, tiles) zeros, to which the number of splats in each tile is added.
+    """
+    m = packed.shape[0]
+    for chunk in prange(_CHUNKS):
+        for s in range(m * chunk // _CHUNKS, m * (chunk + 1) // _CHUNKS):
+            top, _ = _tile_rows(packed[s], tiles_y)
+            low, high = _tile_columns(packed[s], tiles_x)
+            number = 0
+            for place in range(first_row[s], first_row[s + 1]):
+                row, left, right = top + place - first_row[s], low, high
+                if high - low > 1:
+                    left, right = _tile_span(packed[s], row, tiles_x)
+                spans[place, 0], spans[place, 1] = left, max(left, right)
+                for tile in range(row * tiles_x + left, row * tiles_x + right):
+                    counts[chunk, tile] += 1
+                number += max(right - left, 0)
+            listed[s] = number
+
+
+@kernel(parallel=True)
+@no_type_check
+def _list(packed, first_row, tiles_x, tiles_y, spans, first, free, entries, slots):
+    """Fill the tiles' lists; `free (chunks, tiles)` is the place of each chunk's next entry in each tile."""
+    m = packed.shape[0]
+    for chunk in prange(_CHUNKS):
+        for s in range(m * chunk // _CHUNKS, m * (chunk + 1) // _CHUNKS):
+            slot = first[s]
+            top, _ = _tile_rows(packed[s], tiles_y)
+            for place in range(first_row[s], first_row[s + 1]):
+                row_at = (top + place - first_row[s]) * tiles_x
+                for tile in range(row_at + spans[place, 0], row_at + spans[place, 1]):
+                    at = free[chunk, tile]
+                    entries[at], slots[at] = s, slot
+                    free[chunk, tile] = at + 1
+                    slot += 1
+
+
+@kernel
+@no_type_check
+def _sums_before(values):
+    """Compute the sum of the values before each place, and of all at the end."""
+    sums = np.zeros(values.shape[0] + 1, np.int32)
+    for i in range(values.shape[0]):
+        sums[i + 1] = sums[i] + values[i]
+    return sums
 
 
 @kernel
@@ -103,34 +170,22 @@ def bin_splats(splats, order, width, height):
     """
     m = order.shape[0]
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    packed = np.empty((m, COLUMNS), np.float32)
-    first_row, first = np.zeros(m + 1, np.int32), np.zeros(m + 1, np.int32)
-    for s in range(m):
-        packed[s] = splats[order[s]]
-        top, bottom = _tile_rows(packed[s], tiles_y)
-        first_row[s + 1] = first_row[s] + max(bottom - top, 0)
-    spans = _spans(packed, first_row, tiles_x, tiles_y)
+    packed, numbers = np.empty((m, COLUMNS), np.float32), np.empty(m, np.int32)
+    _pack(splats, order, tiles_y, packed, numbers)
+    first_row = _sums_before(numbers)
+    spans = np.empty((first_row[m], 2), np.int32)
+    counts = np.zeros((_CHUNKS, tiles_x * tiles_y), np.int32)
+    _count(packed, first_row, tiles_x, tiles_y, spans, numbers, counts)
+    first = _sums_before(numbers)
     start = np.zeros(tiles_x * tiles_y + 1, np.int32)
-    for s in range(m):
-        top, _ = _tile_rows(packed[s], tiles_y)
-        listed = 0
-        for place in range(first_row[s], first_row[s + 1]):
-            row_at = (top + place - first_row[s]) * tiles_x
-            for tile in range(row_at + spans[place, 0], row_at + spans[place, 1]):
-                start[tile + 1] += 1
-            listed += spans[place, 1] - spans[place, 0]
-        first[s + 1] = first[s] + listed
-    for t in range(tiles_x * tiles_y):
-        start[t + 1] += start[t]
+    for tile in range(tiles_x * tiles_y):
+        # counts become places: the chunks' entries of a tile follow each other, nearest first
+        at = start[tile]
+        for chunk in range(_CHUNKS):
+            number = counts[chunk, tile]
+            counts[chunk, tile] = at
+            at += number
+        start[tile + 1] = at
     entries, slots = np.empty(first[m], np.int32), np.empty(first[m], np.int32)
-    free = start[:-1].copy()
-    for s in range(m):
-        slot = first[s]
-        top, _ = _tile_rows(packed[s], tiles_y)
-        for place in range(first_row[s], first_row[s + 1]):
-            row_at = (top + place - first_row[s]) * tiles_x
-            for tile in range(row_at + spans[place, 0], row_at + spans[place, 1]):
-                entries[free[tile]], slots[free[tile]] = s, slot
-                free[tile] += 1
-                slot += 1
+    _list(packed, first_row, tiles_x, tiles_y, spans, first, counts, entries, slots)
     return packed, start, entries, slots, first
