@@ -38,10 +38,10 @@ _WHITE, _WARM = (1.0, 0.97, 0.92), (1.0, 0.85, 0.65)
 
 @dataclass(frozen=True)
 class Table:
-    """What differs between the rooms."""
+    """Settings that differ between the rooms."""
 
     albedo: Color
-    """Of the table's top, linear RGB."""
+    """Albedo of the table's top, linear RGB."""
     exposure: float
     """Factor on Blender's radiance, by which the top is neither black nor clipped; set by hand."""
     is_spot: bool = False

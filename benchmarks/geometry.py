@@ -1,12 +1,12 @@
-"""Measures how right the surfaces of reconstructions are, on rendered scenes whose true depth is known.
+"""Measures the surface errors of reconstructions on rendered scenes with known depth.
 
     python benchmarks/geometry.py FOLDER [FOLDER ...] [--bare FOLDER] --out build/geometry/geometry.json
     python benchmarks/geometry.py --render-bare FOLDER --blender-python PYTHON
 
-FOLDER has scenes/ and renders/, as `splatgraft paper exam` leaves them. Of each scene the target is reconstructed anew,
+FOLDER has scenes/ and renders/, as `splatgraft paper exam` writes them. Each scene's target is reconstructed again,
 without the held-out views, and measured in all views: near the place of the object, and everywhere. The second command
-renders rooms with a bare table (`bare_tables.py`), of which `near` is the table's top. A picture of each scene lies in
-the folder named like the JSON file; one row for each quality: photo, true depth, rendered depth, normals of the latter.
+renders rooms with a bare table (`bare_tables.py`), where `near` is the table's top. The folder named like the JSON file
+has a picture of each scene, with one row for each quality: photo, true depth, rendered depth and its normals.
 """
 
 import argparse

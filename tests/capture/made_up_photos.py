@@ -49,8 +49,10 @@ def turned_between_series(folder: Path, counts: tuple[int, int], step_deg: float
     return poses
 
 
-def panoramas(folder: Path, count: int, width: int) -> np.ndarray:
+def panoramas(folder: Path, count: int, width: int, *, is_video: bool = False) -> np.ndarray:
     """Write `count` panoramas from a path through a textured room, each turned otherwise, with a person below.
+
+    Those of a video turn slowly, and the camera stays at one height.
 
     The person is a disc of one texture below 50 degrees under the horizon, which moves and turns with the camera.
 
@@ -65,10 +67,12 @@ def panoramas(folder: Path, count: int, width: int) -> np.ndarray:
     rays = np.stack([np.cos(pitch) * np.sin(yaw), -np.sin(pitch), np.cos(pitch) * np.cos(yaw)], -1)
     poses = []
     for i in range(count):
-        turn = 1.3 * i
+        turn = 2 * np.pi * i / count if is_video else 1.3 * i
         pose = _about_z(turn)
         pose[:3, :3] = pose[:3, :3] @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
         pose[:3, 3] = 1.5 * np.cos(2 * np.pi * i / count), 1.2 * np.sin(2 * np.pi * i / count), 0.2 * np.sin(5 * i)
+        if is_video:
+            pose[2, 3] = 0.2 * np.sin(6 * np.pi * i / count)
         color, _ = _box(pose, walls, half=3.0, inside=True, rays=rays)
         below = pitch < np.deg2rad(-50)
         a, b = (100 * (1 + rays[below][:, [0, 2]] / rays[below][:, 1:2])).astype(int).T

@@ -95,3 +95,23 @@ def test_panoramas_of_a_room_get_their_poses(tmp_path: Path) -> None:
     assert np.rad2deg(np.arccos(np.clip(cosine, -1, 1))).max() < 0.5
     # upright: the views towards the horizon look level, and the walls' points lie within the room
     assert float(posed.cameras.world_from_camera[:, 2, 2].reshape(8, 8)[:, :4].abs().max()) < 0.02
+
+
+@needs_colmap
+@pytest.mark.long
+def test_a_360_video_is_posed_as_panoramas(tmp_path: Path) -> None:
+    truth = panoramas(tmp_path / "frames", 24, 1024, is_video=True)
+    video = cv2.VideoWriter(str(tmp_path / "walk.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10, (1024, 512))
+    for file in sorted((tmp_path / "frames").iterdir()):
+        video.write(cv2.imread(str(file)))
+    video.release()
+    out = tmp_path / "capture"
+    assert main(["capture", str(tmp_path / "walk.mp4"), "--out", str(out), "--threads", "1"]) == 0
+    posed = read_capture(out)
+    centers = posed.cameras.centers.reshape(-1, 8, 3)
+    assert len(centers) >= 8
+    assert float((centers - centers[:, :1]).norm(dim=-1).max()) < 1e-5
+    numbers = [int(name.split("_")[1]) for name in posed.cameras.names[::8]]
+    _, error = similarity_to(truth[numbers, :3, 3], centers[:, 0].double().numpy())
+    # as for panoramas that are photos, and twice that for the video's compression
+    assert error < 0.02 * 3

@@ -49,7 +49,7 @@ class Demo:
     width: int = 1280
     """Width of the report's pictures, pixels."""
     iterations: int = 2000
-    """Training steps of the table; the bananas take half, because the object is fitted again, in at most as many."""
+    """Training steps of the table; the bananas take half, and the object's second fit takes at most this many."""
     budget: int = 30_000
     """Maximum number of Gaussians of each scene."""
 

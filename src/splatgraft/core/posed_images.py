@@ -20,7 +20,7 @@ class LeftOut:
     name: str
     """Name of the image in the capture."""
     reason: str
-    """Reason in one line: what was expected and what was found."""
+    """Reason in one line: the expected and the found value."""
     mask_only: bool = False
     """Whether only the mask is left out."""
 

@@ -1,4 +1,4 @@
 """The web editor: select and place objects and adjust their light in the browser.
 
-A project's state and its files, a server, pictures of our renderer, and jobs and light in child processes.
+A server sends pictures of our renderer. Jobs and the light transfer run in child processes.
 """

@@ -14,10 +14,10 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 def why_refused(token: str, headers: Mapping[str, str], path: str) -> str | None:
-    """Why a request is refused, as a message for the user; None where it is accepted.
+    """Return the reason for refusing a request, as a message for the user; None if it is accepted.
 
     Args:
-        token: What each request must carry: in the address, or as a cookie afterwards.
+        token: Token that each request must carry, in the address or as a cookie.
         headers: Request headers, names in canonical capitalisation; a repeated header is joined by commas.
         path: Request path with its query.
     """
@@ -37,15 +37,15 @@ def why_refused(token: str, headers: Mapping[str, str], path: str) -> str | None
 
 
 def cookie_name(host: str) -> str:
-    """Name of the cookie for a Host header: browsers send the cookies of all ports of a host to each of them."""
+    """Name the cookie for a Host header, with its port, because browsers share cookies between ports."""
     port = re.search(r":([0-9]+)$", host)
     return f"splatgraft_token_{port[1] if port else 'default'}"
 
 
 def allowed_query(path: str) -> str | None:
-    """The query with which a page is to be opened instead of this path, with its question mark; None where it can stay.
+    """Return the query to redirect to, with its question mark; None if the query of this path is allowed.
 
-    Only the token is allowed, so that no link can set anything else.
+    Only the token is allowed, because a link must not set anything else.
     """
     given = parse_qsl(urlsplit(path).query, keep_blank_values=True)
     allowed = [(key, value) for key, value in given if key == "token"]
@@ -53,6 +53,6 @@ def allowed_query(path: str) -> str | None:
 
 
 def _name(host: str) -> str:
-    """The name in a Host header; empty where the header is malformed."""
+    """Return the name in a Host header; empty if the header is malformed."""
     found = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+)(:[0-9]+)?", host)
     return found[1].strip("[]").lower() if found else ""

@@ -1,7 +1,7 @@
-"""A placed object held by the pointer: moved along its support, turned, scaled or lifted, in one view.
+"""Dragging of a placed object in one view: along its support, or to turn, scale or lift it.
 
-The placement at each moment of a drag is the placement after it. A moved object keeps its turn and stops where its foot
-would leave the support.
+The placement shown during a drag is the one that a release keeps. A moved object keeps its yaw and stops before its
+foot leaves the support.
 """
 
 import math
@@ -24,30 +24,30 @@ from splatgraft.rendering import render
 
 DragMode = Literal["move", "turn", "size", "lift"]
 Point2 = tuple[float, float]
-"""x and y on a canvas, over its width and height."""
+"""x and y as fractions of a canvas's width and height."""
 
-_TURN = 2 * math.pi  # angle of a drag over the whole width, radians
-_GROWTH = 2.0  # logarithm of the scale after a drag over the whole width
-_DEPTH_WIDTH = 320  # pixels; the picture of depths by which the pointer finds the support
+_TURN = 2 * math.pi  # radians for a drag over the whole width
+_GROWTH = 2.0  # log of the scale factor for a drag over the whole width
+_DEPTH_WIDTH = 320  # pixels; width of the depth map that gives the surface under the pointer
 _FLAT = 0.6  # share of the foot's disc that must lie on the support, as for a duplicate
-_ALIKE = 0.85  # of the share where the drag began: an object on rough ground can be moved along it
-_STEP = 0.5  # largest change of height in a drag over the object's height, unless another support is wanted
-_NEAR = 0.5  # height above the support over the object's within which an object stands on it
-_STRAIGHT = math.cos(math.radians(10.0))  # an object that is tilted more against its support keeps its tilt
-_EVEN = math.cos(math.radians(1.5))  # an object follows larger tilts of its support; every turn makes drafts slow
-_NEAR_RADII = 10  # half the side of the box of Gaussians among which supports are searched, over the foot's radius
-_HALVINGS = 5  # of the way to a place where the object cannot stand: 3% of it
-_HULL_POINTS = 400  # points of an object that its outline is made of
-_MIN_SIN = 0.05  # sine of the angle between a ray and the horizontal, below which they do not meet
+_ALIKE = 0.85  # factor on the share at the start, which lowers `_FLAT` on rough ground
+_STEP = 0.5  # largest height change in a drag over the object's height, unless `anywhere`
+_NEAR = 0.5  # largest distance over the object's height at which an object rests on a support
+_STRAIGHT = math.cos(math.radians(10.0))  # an object tilted more from its support keeps its tilt
+_EVEN = math.cos(math.radians(1.5))  # smaller tilts of a support are ignored, because rotations slow drafts
+_NEAR_RADII = 10  # half the side of the box in which a support is searched, over the foot's radius
+_HALVINGS = 5  # bisection steps towards a place off the support; they resolve 3% of the way
+_HULL_POINTS = 400  # points of an object from which its outline is computed
+_MIN_SIN = 0.05  # sine of a ray's angle to the horizontal; flatter rays do not meet a level plane
 
 
 class Drag:
-    """An object as it was when it was grabbed, and the view in which it is dragged."""
+    """A grabbed object with its initial placement, and the view in which it is dragged."""
 
     def __init__(
         self, item: PlaceableObject, placed: Similarity, camera: Cameras, place: Gaussians, *, up: Tensor
     ) -> None:
-        """Grab an object at its placement; `place` is the scene without it."""
+        """Grab an object at its placement; `place` is the rest of the scene."""
         self.item, self.placed, self._up = item, placed, torch.nn.functional.normalize(up, dim=0)
         # colours do not matter for a surface
         self._place = place.with_sh_degree(0)
@@ -66,7 +66,7 @@ class Drag:
         self._best = placed
 
     def at(self, mode: DragMode, start: Point2, pointer: Point2, *, anywhere: bool = False) -> Similarity:
-        """The placement with the pointer elsewhere than where it grabbed; `anywhere`: on another support, too."""
+        """Return the placement after a drag from `start` to `pointer`; `anywhere` permits another support."""
         dx, dy = pointer[0] - start[0], pointer[1] - start[1]
         if mode == "turn":
             turn = rotation_about(self._up, _TURN * dx).float()
@@ -80,7 +80,7 @@ class Drag:
     # along the support
 
     def _slid(self, wanted: Float[Tensor, "3"], *, anywhere: bool) -> Similarity:
-        """The placement nearest to a wanted foot at which the object stands, on the way from where it stood last."""
+        """Return the valid placement nearest to the wanted foot, on the line from the last valid one."""
         if not self._stands:
             return self._shifted(wanted)
         begin, share, step = self._last, 1.0, 0.5
@@ -95,7 +95,7 @@ class Drag:
         return self._best
 
     def _rested(self, foot: Float[Tensor, "3"], *, anywhere: bool) -> Similarity | None:
-        """The object at rest on the support at a foot; None where it cannot stand there."""
+        """Place the object on the support at a foot; return None if it cannot rest there."""
         support = self._support(foot)
         if support is None or support.flat_fraction < self._flat:
             return None
@@ -110,17 +110,17 @@ class Drag:
 
     def _support(self, foot: Float[Tensor, "3"]) -> Support | None:
         radius, height = self.placed.scale * self.item.base.radius, self.placed.scale * self.item.base.height
-        # only what lies around matters, and drawing it is fast
+        # a search among nearby Gaussians is fast
         if self._near is None or float((self._near[0] - foot).abs().max()) > 2 * radius:
             near = (self._place.means - foot).abs().amax(1) < _NEAR_RADII * radius + height
             self._near = foot, self._place.select(near)
         try:
             return support_below(self._near[1], foot + 0.5 * height * self._up, up=self._up, radius=radius)
         except ValueError:
-            return None  # nothing lies below
+            return None  # no surface below
 
     def _pointed_at(self, dx: float, dy: float, *, anywhere: bool) -> Float[Tensor, "3"]:
-        """The foot under the pointer: on the surface there, or at its own height where that is another surface."""
+        """Return the foot under the pointer: on the surface there, or at its last height if that surface is another."""
         u, v = self._pixel(dx, dy)
         ray, origin = self._ray(u, v), self._camera.centers[0]
         depth = float(self._depth[int(v), int(u)])
@@ -142,7 +142,7 @@ class Drag:
         return min(max(u, 0.0), self._camera.width - 1.0), min(max(v, 0.0), self._camera.height - 1.0)
 
     def _ray(self, u: float, v: float) -> Float[Tensor, "3"]:
-        """The ray through a pixel, of depth 1."""
+        """Return the ray through a pixel, scaled to depth 1."""
         k = self._camera.intrinsics[0]
         local = torch.tensor([(u - float(k[0, 2])) / float(k[0, 0]), (v - float(k[1, 2])) / float(k[1, 1]), 1.0])
         return self._camera.world_from_camera[0, :3, :3] @ local
@@ -150,7 +150,7 @@ class Drag:
     # up and down
 
     def _lifted(self, dy: float) -> Float[Tensor, "3"]:
-        """The foot above or below where it was, so that it follows the pointer."""
+        """Return the foot, moved vertically to follow the pointer."""
         pose = self._camera.camera_from_world[0]
         local, up = pose[:3, :3] @ self._foot + pose[:3, 3], pose[:3, :3] @ self._up
         # pixels down the image for one unit upwards
@@ -165,13 +165,13 @@ class Drag:
 
 @dataclass(frozen=True)
 class Corner:
-    """A point in the scene that the pointer drags at its depth in a view, such as the corner of a box."""
+    """A scene point that is dragged at its depth in a view, such as the corner of a box."""
 
     point: Float[Tensor, "3"]
     camera: Cameras
 
     def at(self, pointer: Point2) -> Float[Tensor, "3"]:
-        """The point under the pointer."""
+        """Return the point under the pointer."""
         depth = self.camera.project(self.point)[1]
         k, pose = self.camera.intrinsics[0], self.camera.world_from_camera[0]
         pixel = torch.tensor([pointer[0] * self.camera.width, pointer[1] * self.camera.height, 1.0])
@@ -179,7 +179,7 @@ class Corner:
 
 
 def outline(points: Float[Tensor, "n 3"], camera: Cameras) -> list[Point2]:
-    """The convex outline of points in a view, on its canvas; empty where they are behind the camera."""
+    """Compute the convex outline of points on a view's canvas; empty if they are behind the camera."""
     pixels, depth = camera.project(points[:: max(1, len(points) // _HULL_POINTS)])
     pixels = pixels[depth > 0]
     if len(pixels) < 3:
@@ -189,7 +189,7 @@ def outline(points: Float[Tensor, "n 3"], camera: Cameras) -> list[Point2]:
 
 
 def on_canvas(points: Float[Tensor, "n 3"], camera: Cameras) -> list[Point2 | None]:
-    """Points in a view, on its canvas; None for those behind the camera."""
+    """Project points onto a view's canvas; None for those behind the camera."""
     pixels, depth = camera.project(points)
     size = (pixels / camera.sizes[0].to(pixels)).tolist()
     return [(round(x, 4), round(y, 4)) if far > 0 else None for (x, y), far in zip(size, depth.tolist(), strict=True)]

@@ -1,4 +1,4 @@
-"""The editor: the open project, its windows and steps, and what they show. `Server` tells it what windows send."""
+"""The open project with its steps and windows, and the handling of the messages that `Server` receives."""
 
 import contextlib
 import json
@@ -46,36 +46,36 @@ KINDS: dict[str, Kind] = {
     "Shadow alone": "shadow",
     "Photo": "photo",
 }
-"""Kinds of pictures of the target, by the name that a user chooses."""
+"""Kinds of pictures of the target, by the label in the menu."""
 _POLL_SECONDS = 0.4
-_MARK_SECONDS = 1.0  # how long nothing must change before the steps are marked anew
-_DRAWN_SECONDS = 0.3  # that the next move of a drag waits for the picture of the last one
+_MARK_SECONDS = 1.0  # time without a change before the steps' marks are updated
+_DRAWN_SECONDS = 0.3  # longest wait of a drag's next move for the picture of the last one
 _CURRENT, _DONE, _STALE, _NEXT = "●", "✓", "↻", "›"
 _WORDS = {"do": "id", "live": "id", "key": "key", "step": "to"}
-"""Kinds of messages about the panel, with the field that names something."""
-_MAX_ACTIONS = 200  # messages that wait
+"""Kinds of messages about the panel, with the field that must be a string."""
+_MAX_ACTIONS = 200  # waiting messages
 _UPLOADS_FOLDER = "uploads"
-_GREY = 48  # of a picture that cannot be drawn, 0 to 255
+_GREY = 48  # value of a picture that cannot be drawn, 0 to 255
 _FULL_DISK = "Disk full: not saved."
 
 
 class Editor:
-    """One project in all windows of a server."""
+    """A project, shown in all windows of a server."""
 
     def __init__(self, server: Server, project: Project) -> None:
-        """Open the project where there is one, and serve it."""
+        """Open the project if it exists, and serve it."""
         self.server, self.project = server, project
         self.lock = threading.RLock()
         self.session: Session | None = None
         self.problem: str | None = None
-        """Why the project could not be opened; None where it could, or where there is none."""
+        """Reason why the project could not be opened; None if it is open or does not exist."""
         self.step = "Open"
         self.live: EditState | None = None
-        """What is shown during a drag, in place of the saved state."""
+        """State shown during a drag, in place of the saved one."""
         self.kind, self.before = "With its new light", "Pasted, unlit"
         self.status, self.is_bad, self.is_unsaved = "", False, False
         self.offer: dict[str, Any] | None = None
-        """A file that the window that edits is to download."""
+        """File for the editing window to download."""
         self.pictures: Pictures | None = None
         self._light: LightProcess | None = None
         self._form = Form()
@@ -88,7 +88,7 @@ class Editor:
         self._is_open = True
         self._actions: queue.Queue[tuple[Window, dict[str, Any]] | None] = queue.Queue(_MAX_ACTIONS)
         self._moves: dict[str, Any] | None = None
-        """The newest move of the pointer, which replaces earlier ones that wait."""
+        """Newest waiting move of the pointer; it replaces earlier ones."""
         self.stream = Stream(self, self._drawing_failed)
         self._marker = LatestOnlyWorker(self._find_marks, self._failed)
         self.panels: dict[str, Panel] = {
@@ -110,7 +110,7 @@ class Editor:
             thread.start()
 
     def close(self) -> None:
-        """End all threads and the light process, but no job."""
+        """End all threads and the light process; jobs continue."""
         self._is_open = False
         self._actions.put(None)
         for closed in (self.stream, self._marker, self._light, *self.panels.values()):
@@ -120,7 +120,7 @@ class Editor:
     # the project
 
     def open_project(self) -> None:
-        """Open the project where there is one, at the step that comes next; what prevents it is kept as `problem`."""
+        """Open the project, if it exists, at its next step; store an error as `problem`."""
         self.session, self.problem, self._seen = None, None, stamps_of(self.project.file)
         if self._light is not None:
             self._light.close()
@@ -140,22 +140,22 @@ class Editor:
             self.show_step("Open")
             return
         if files.relit.is_file() and session.why_stale("relight") is None and self.pictures is not None:
-            with contextlib.suppress(ValueError, OSError):  # then it is computed
+            with contextlib.suppress(ValueError, OSError):  # the light is then computed
                 self.pictures.lit.adopt(session.placed_state())
         self.show_step("Place" if files.object.is_file() else "Select")
 
     def require_session(self) -> Session:
-        """The open project; ValueError where there is none."""
+        """Return the open project; raise ValueError if no project is open."""
         if self.session is None:
             raise ValueError("Start a project first.")
         return self.session
 
     def shown_state(self) -> EditState:
-        """The state that pictures show: that of a drag, else the saved one."""
+        """Return the state of the current drag, or the saved state."""
         return self.live or self.require_session().placed_state()
 
     def show_live(self, state: EditState | None) -> None:
-        """Show a state during a drag; None: the saved one."""
+        """Show a state during a drag; None shows the saved one."""
         self.live = state
         self._want_light()
         self.stream.touch(moving=True)
@@ -166,14 +166,14 @@ class Editor:
         session.start_job(session.project.run_words(to), title)
         self.say(f"{title}: started; it continues if you close this page")
 
-    # what windows see
+    # the panel and the status line
 
     def say(self, sentence: str, *, bad: bool = False) -> None:
         """Show one sentence in the status line."""
         self.status, self.is_bad = " ".join(sentence.split()), bad
 
     def refresh(self) -> None:
-        """Describe the panel anew, and draw."""
+        """Rebuild the panel and redraw."""
         with self.lock:
             form = Form()
             with self.reported():
@@ -189,7 +189,7 @@ class Editor:
             self._marker.submit(self.session)
 
     def _add_view(self, form: Form) -> None:
-        """Controls of the picture, which all steps of the target share."""
+        """Add the controls of the picture, common to all steps of the target."""
         form.choice("kind", "Picture", self.kind, list(KINDS), lambda value: setattr(self, "kind", value))
         form.choice(
             "before", "Compare with", self.before, list(KINDS), lambda value: setattr(self, "before", value),
@@ -198,7 +198,7 @@ class Editor:
         self.add_photos(form)
 
     def add_photos(self, form: Form) -> None:
-        """The slider that steps through the photos."""
+        """Add the slider that steps through the photos."""
         cameras, view = self.cameras(), self.editing()
         if cameras is not None and len(cameras) > 1 and view is not None:
             photo = 1 if view.photo is None else view.photo + 1
@@ -227,13 +227,13 @@ class Editor:
             view.window.send("panel", json.dumps(panel | own))
 
     def editing(self) -> View | None:
-        """The window that edits; None where none is open."""
+        """Return the editing window's view; None if no window is open."""
         return self.stream.views[0] if self.stream.views else None
 
     # drawing, in the thread of the stream
 
     def draw(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], dict[str, Any]]:
-        """A picture of a window's view, and what lies over it."""
+        """Draw a window's view and its overlay."""
         panel, pictures, problem = self.panels[self.step], self.pictures, ""
         over: dict[str, Any] = {}
         try:
@@ -247,7 +247,7 @@ class Editor:
         return pixels, over | {"caption": caption, "problem": problem, "step": self.step}
 
     def draw_target(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
-        """The target as it is chosen, with the picture before left of the divider, and the caption."""
+        """Draw the target, with the comparison picture left of the divider, and its caption."""
         pictures, state, kind = self.pictures, self.shown_state(), KINDS[self.kind]
         assert pictures is not None
         column = round(view.split * camera.width)
@@ -271,7 +271,7 @@ class Editor:
         return parts[0] if len(parts) == 1 else np.concatenate(parts, 1), caption
 
     def orbit(self, view: View) -> Orbit | None:
-        """Where a window looks from, kept in free space; None where there is nothing to see."""
+        """Return a window's view, kept in free space; None if there is no scene to show."""
         side, session = self.side, self.session
         if session is None:
             return None
@@ -288,7 +288,7 @@ class Editor:
         if space is None:
             return found
         kept = space.kept(found)
-        # the wish for a distance stays, so that the view goes back behind what it has passed
+        # the stored view keeps its distance, so that the camera moves back when the way is free
         wished = kept.zoomed(found.distance / kept.distance, scale=found.distance) if kept is not found else found
         if view.orbits.get(side) is found:
             view.orbits[side] = wished
@@ -296,11 +296,11 @@ class Editor:
 
     @property
     def side(self) -> str:
-        """The scene that the step shows."""
+        """Scene that the step shows, `source` or `target`."""
         return "source" if self.step == "Select" else "target"
 
     def cameras(self) -> Cameras | None:
-        """The cameras of the scene that the step shows; None where they or the scene are not there yet."""
+        """Return the cameras of the shown scene; None if they or the scene do not exist yet."""
         if self.session is None:
             return None
         files = self.session.files
@@ -312,10 +312,10 @@ class Editor:
         return self.session.scenes.cameras(path) if path.is_file() and scene.is_file() else None
 
     def up(self) -> np.ndarray:
-        """Up direction of the scene that the step shows."""
+        """Return the up direction of the shown scene."""
         session, cameras = self.require_session(), self.cameras()
         if self._ups.get(self.side, (None, None))[0] is not cameras:
-            # kept here, because views must not wait for what a session computes
+            # kept here, because views must not wait for a session's computations
             self._ups[self.side] = (cameras, session.up(self.side).double().numpy())
         return self._ups[self.side][1]
 
@@ -368,22 +368,22 @@ class Editor:
         self.say(str(error), bad=True)
         self._send_panel()
 
-    # what windows send, in the thread of the server
+    # messages of windows, in the thread of the server
 
     def opened(self, window: Window) -> None:
-        """Draw for a new window."""
+        """Start to draw for a new window."""
         self.stream.add(View(window))
         self._send_panel()
         with contextlib.suppress(queue.Full):
             self._actions.put_nowait((window, {"t": "opened"}))
 
     def closed(self, window: Window) -> None:
-        """Draw for it no more; the next oldest edits."""
+        """Stop drawing for a window; the next oldest one edits."""
         self.stream.remove(window)
         self._send_panel()
 
     def received(self, window: Window, message: dict[str, Any]) -> None:
-        """Take a message; views move at once, all else waits in line."""
+        """Handle a message: move views at once and queue all else."""
         view, kind = self.stream.of(window), message["t"]
         if view is None:
             return
@@ -435,7 +435,7 @@ class Editor:
             self.stream.touch(view, moving=True)
 
     def scene_scale(self) -> float:
-        """Typical distance of the scene that the step shows."""
+        """Return the typical distance of the shown scene."""
         cameras = self.cameras()
         return 1.0 if cameras is None else typical_distance(cameras)
 
@@ -447,7 +447,7 @@ class Editor:
             view.orbits[self.side] = through(cameras[view.photo], typical_distance(cameras))
             self.stream.touch(view)
 
-    # actions of the window that edits, in a thread of their own
+    # actions of the editing window, in a thread of their own
 
     def _act(self) -> None:
         while (action := self._actions.get()) is not None:
@@ -460,24 +460,24 @@ class Editor:
                 if view is not None and view.window is window:
                     self._take_action(view, message)
             if is_move and view is not None:
-                # places that no picture shows would only delay those that one does
+                # placements that are never drawn would delay the next picture
                 self.stream.wait_drawn(view, _DRAWN_SECONDS)
 
     def _take_action(self, view: View, message: dict[str, Any]) -> None:
         is_move = message["t"] == "live" or (message["t"] == "pointer" and message["what"] == "move")
         if self.is_bad and not is_move and message["t"] != "opened":
-            self.say("")  # an error holds until the next action
+            self.say("")  # an error stays until the next action
         with self.reported():
             getattr(self, f"_do_{message['t']}")(view, message)
         if not is_move:
             self.refresh()
 
     def _do_opened(self, view: View, message: dict[str, Any]) -> None:
-        """What is only computed for a window follows: the light."""
+        """Do nothing; the `refresh` that follows requests the light."""
 
     def _do_do(self, view: View, message: dict[str, Any]) -> None:
         if not self._form.offers(message["id"], message.get("value")):
-            return  # of a panel that has changed meanwhile
+            return  # the panel has changed meanwhile
         self._form.handle(message["id"], message.get("value"))
 
     def _do_live(self, view: View, message: dict[str, Any]) -> None:
@@ -561,11 +561,11 @@ class Editor:
     # files
 
     def file(self, name: str) -> Path | None:
-        """The file that is served for a name."""
+        """Return the file to serve for a name."""
         return None if self.session is None else served_file(self.session.files, name)
 
     def upload_path(self, name: str) -> Path:
-        """Where an uploaded file goes, below a folder of its own if its name begins with one."""
+        """Choose a free path for an uploaded file, in a subfolder if its name begins with one."""
         folder, _, given = name.replace("\\", "/").rpartition("/")
         path = Path(given)
         if not path.suffix or path.name.startswith(".") or "\x00" in given or len(given) > 200:
@@ -581,7 +581,7 @@ class Editor:
         return found
 
     def uploaded(self, path: Path, use: str) -> None:
-        """Use an uploaded file; twice the same file is one."""
+        """Use an uploaded file, or an identical earlier one."""
         twins = [
             one
             for one in sorted(path.parent.glob(f"{re.sub(r'_[0-9]+$', '', path.stem)}*{path.suffix}"))
@@ -613,7 +613,7 @@ class Editor:
                     self.poll()
 
     def poll(self) -> None:
-        """Load what was changed outside the editor, save what could not be, and show how far the job is."""
+        """Load outside changes, retry a failed save, and show the job's progress."""
         session = self.session
         with self.reported():
             if self.problem is not None and stamps_of(self.project.file) != self._seen:
@@ -652,7 +652,7 @@ class Editor:
         self.refresh()
 
     def _job(self) -> dict[str, Any] | None:
-        """The running job, as the page shows it."""
+        """Describe the running job for the page."""
         state = None if self.session is None else self.session.jobs.state()
         if state is None or not state.live:
             return None
@@ -678,7 +678,7 @@ class Editor:
         self.say("stopping")
 
     def _find_marks(self, session: Session | None) -> None:
-        """Find which steps are done, out of date, or next, once nothing has changed for a moment."""
+        """Update the marks of the steps when nothing has changed for a moment."""
         if self._marker.wait_idle(_MARK_SECONDS):
             marks = {} if session is None else _marks(session)
             with self.lock:
@@ -688,7 +688,7 @@ class Editor:
 
 
 def _marks(session: Session) -> dict[str, str]:
-    """The marks of the steps that are done, out of date, or next."""
+    """Mark the steps that are done, out of date, or next."""
     files, reasons = session.files, session.project.reasons()
 
     def state(exists: bool, *steps: str) -> str | None:
@@ -705,13 +705,13 @@ def _marks(session: Session) -> dict[str, str]:
         "Run": state(files.result.is_file(), "consolidate"),
         "Share": None if not exports else _DONE if exports[0].stat().st_mtime_ns >= result else _STALE,
     }
-    # a light is found without being set
+    # the light is estimated if it is not set
     following = next((name for name, mark in states.items() if mark is None and name != "Light"), None)
     return {name: mark or _NEXT for name, mark in states.items() if mark is not None or name == following}
 
 
 def _share(value: Any) -> float:
-    """A drag or a place over a canvas's side."""
+    """Parse a drag or position in units of a canvas's side."""
     number = float(value)
     if isinstance(value, bool) or not -10 < number < 10:
         raise ValueError("expected a place near the canvas")

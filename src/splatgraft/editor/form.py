@@ -1,6 +1,6 @@
-"""The panel as a value: a step describes its controls anew after every change, and the page draws what differs.
+"""A panel's controls as a value: steps rebuild them after every change, and the page draws the differences.
 
-A control's handler is called with what a browser sent only if the control offers that value.
+A control's handler is called with a browser's value only if the control offers that value.
 """
 
 import math
@@ -12,12 +12,12 @@ _MAX_TEXT = 4096  # characters; paths are shorter on all systems
 
 
 class Form:
-    """Controls in their order, and their handlers."""
+    """Controls in order, with their handlers."""
 
     def __init__(self) -> None:
         """Start without controls."""
         self.controls: list[dict[str, Any]] = []
-        """What the page draws; the kinds are those of `editor.js`."""
+        """Controls for the page to draw; `editor.js` defines their kinds."""
         self._handlers: dict[str, tuple[Callable[[Any], Any], Handler]] = {}
         self._is_more = False
 
@@ -26,39 +26,39 @@ class Form:
         self._is_more = True
 
     def note(self, text: str, *, name: str = "note", bad: bool = False, faint: bool = False) -> None:
-        """A paragraph; nothing where the text is empty."""
+        """Add a paragraph unless the text is empty."""
         if text:
             self._add("note", name, text=text, bad=bad, faint=faint)
 
     def button(
         self, name: str, label: str, work: Callable[[], object], *, main: bool = False, disabled: bool = False
     ) -> None:
-        """A button; `main` marks the one that continues the step."""
+        """Add a button; `main` marks the one that continues the step."""
         self._add("button", name, label=label, main=main, disabled=disabled)
         if not disabled:
             self._handlers[name] = (lambda value: None, lambda _: work())
 
     def buttons(self, name: str, choices: Mapping[str, Callable[[], object]]) -> None:
-        """Several buttons in a row."""
+        """Add a row of buttons."""
         self._add("buttons", name, options=list(choices))
         self._handlers[name] = (_one_of(list(choices)), lambda value: choices[value]())
 
     def check(self, name: str, label: str, value: bool, work: Handler, *, hint: str = "") -> None:
-        """A checkbox."""
+        """Add a checkbox."""
         self._add("check", name, label=label, value=value, hint=hint)
         self._handlers[name] = (_one_of([False, True]), work)
 
     def choice(
         self, name: str, label: str, value: str, options: Sequence[str], work: Handler, *, hint: str = ""
     ) -> None:
-        """One of several."""
+        """Add a menu."""
         self._add("choice", name, label=label, value=value, options=list(options), hint=hint)
         self._handlers[name] = (_one_of(options), work)
 
     def slider(
         self, name: str, label: str, value: float, ends: tuple[float, float, float], work: Handler, *, hint: str = ""
     ) -> None:
-        """A number between two ends, which are given with the step."""
+        """Add a slider; `ends` are its minimum, maximum and step."""
         low, high, step = ends
         self._add("slider", name, label=label, value=value, min=low, max=high, step=step, hint=hint)
 
@@ -72,7 +72,7 @@ class Form:
     def numbers(
         self, name: str, label: str, values: Sequence[float], work: Handler, *, step: float = 0.001, hint: str = ""
     ) -> None:
-        """Fields for one or several numbers; the handler gets a tuple, and refuses what cannot be."""
+        """Add number fields; the handler gets a tuple and rejects impossible values."""
         self._add("numbers", name, label=label, value=list(values), step=step, hint=hint)
 
         def checked(given: Any) -> tuple[float, ...]:
@@ -83,25 +83,25 @@ class Form:
         self._handlers[name] = (checked, work)
 
     def text(self, name: str, label: str, value: str, work: Handler, *, hint: str = "", browse: bool = False) -> None:
-        """A line of text; `browse` adds a button that opens the folders of this machine."""
+        """Add a text field; `browse` adds a button that opens the folders of this machine."""
         self._add("text", name, label=label, value=value, hint=hint, browse=browse)
         self._handlers[name] = (_text, work)
 
     def hidden(self, name: str, work: Callable[[], object]) -> None:
-        """A handler of a part of another control, such as its button `browse`."""
+        """Add a handler for part of another control, such as its button `browse`."""
         self._handlers[name] = (lambda value: None, lambda _: work())
 
     def rows(self, name: str, rows: Sequence[str], work: Handler) -> None:
-        """Lines of which one is clicked."""
+        """Add a list of clickable lines."""
         self._add("rows", name, options=list(rows))
         self._handlers[name] = (_one_of(rows), work)
 
     def upload(self, name: str, label: str, suffixes: Sequence[str], *, many: bool = False) -> None:
-        """A button and a place to drop files on; the server gets them by another request."""
+        """Add an upload button and a drop area; the files are sent by separate requests."""
         self._add("upload", name, label=label, accept=",".join(suffixes), many=many)
 
     def drawing(self, name: str, svg: str, work: Handler) -> None:
-        """An SVG whose dots are dragged; the handler gets the dot's number, x, y and whether the drag has ended."""
+        """Add an SVG with draggable dots; the handler gets the dot's number, x, y and whether the drag has ended."""
         self._add("drawing", name, svg=svg)
 
         def checked(given: Any) -> tuple[int, float, float, bool]:
@@ -113,11 +113,11 @@ class Form:
         self._handlers[name] = (checked, work)
 
     def progress(self, name: str, share: float) -> None:
-        """A bar, filled to a share in [0, 1]."""
+        """Add a progress bar; `share` is in [0, 1]."""
         self._add("progress", name, value=round(share, 3))
 
     def links(self, name: str, links: Sequence[tuple[str, str, str | None, str]]) -> None:
-        """Files: name, remark, address that opens it or None, address that downloads it or an empty text."""
+        """Add files: name, remark, address to open or None, address to download or an empty string."""
         if links:
             self._add("links", name, options=[list(link) for link in links])
 
@@ -132,7 +132,7 @@ class Form:
         work(check(value))
 
     def offers(self, name: str, value: Any) -> bool:
-        """Whether there is such a control, and it offers that value."""
+        """Return whether a control exists and offers a value."""
         try:
             self._handlers[name][0](value)
         except (ValueError, TypeError, KeyError):

@@ -27,32 +27,32 @@ from splatgraft.runtime.files import atomic_write, relative_name, writable
 
 _HISTORY_FILE, _STATES_FOLDER = "history.json", "states"
 _IN_MEMORY = 20
-"""Number of states held in memory; memos recognise such a state by the identity of its parts."""
+"""Number of states held in memory, because memos compare the parts of states by identity."""
 
 
 @dataclass(frozen=True)
 class History:
-    """The names of the present state, of all earlier ones, and of those that were undone."""
+    """Names of the current state, the earlier states and the undone states."""
 
     present: str
-    """The current state."""
+    """Current state."""
     past: tuple[str, ...] = ()
     """Earlier states, oldest first."""
     future: tuple[str, ...] = ()
     """Undone states, the most recently undone last."""
 
     def pushed(self, name: str) -> "History":
-        """The history after a new step; undone states are discarded."""
+        """Return the history after a new step; undone states are discarded."""
         return History(name, (*self.past, self.present))
 
     def undone(self) -> "History":
-        """One step back; itself where there is none."""
+        """Go one step back; return the same object if impossible."""
         if not self.past:
             return self
         return History(self.past[-1], self.past[:-1], (*self.future, self.present))
 
     def redone(self) -> "History":
-        """One step forward again; itself where there is none."""
+        """Go one step forward; return the same object if impossible."""
         if not self.future:
             return self
         return History(self.future[-1], (*self.past, self.present), self.future[:-1])
@@ -68,13 +68,13 @@ class StateStore:
         self._recent: OrderedDict[str, EditState] = OrderedDict()
 
     def name(self, state: EditState) -> str:
-        """The name of a state, which need not be stored."""
+        """Return the name of a state, which need not be stored."""
         name = _name(self._content(state))
         self._remember(name, state)
         return name
 
     def save(self, state: EditState) -> str:
-        """Write the state unless it is stored already; returns its name."""
+        """Write the state unless it is stored already; return its name."""
         with writable(self._states):
             self._states.mkdir(parents=True, exist_ok=True)
         content = self._content(state)
@@ -86,7 +86,7 @@ class StateStore:
         return name
 
     def read(self, name: str) -> EditState:
-        """The state of that name; ValueError or OSError where its file is not what was stored."""
+        """Read a state by name; raise ValueError or OSError if its file is damaged or missing."""
         if name not in self._recent:
             content = self._file(name).read_bytes()
             if _name(content) != name:
@@ -96,7 +96,7 @@ class StateStore:
         return self._recent[name]
 
     def read_history(self) -> History | None:
-        """Read the history and delete states that are not in it; None where none is stored, or it is damaged."""
+        """Read the history and delete unused states; return None if it is missing or damaged."""
         try:
             found = json.loads((self._folder / _HISTORY_FILE).read_text(encoding="utf-8"))
             history = History(found["present"], tuple(found["past"]), tuple(found["future"]))
@@ -177,7 +177,7 @@ def _object_from_json(fields: dict[str, Any], project_folder: Path) -> ObjectPla
 
 
 def _packed(flags: Tensor | None) -> str | None:
-    """One byte per Gaussian, compressed, as text."""
+    """Encode one byte per Gaussian as compressed text."""
     return None if flags is None else base64.b64encode(zlib.compress(flags.numpy().tobytes())).decode()
 
 

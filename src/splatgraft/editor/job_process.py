@@ -1,6 +1,6 @@
-"""The child process of the editor's jobs: the command `run` or `export`, with its progress written to a state file.
+"""The child process of a job, which executes `run` or `export` and writes its progress to a state file.
 
-Started as `python -m splatgraft.editor.job_process FOLDER TITLE COMMAND WORDS...`; not a command.
+`Jobs` starts it as `python -m splatgraft.editor.job_process FOLDER TITLE COMMAND WORDS...`.
 """
 
 import os
@@ -27,13 +27,13 @@ class JobConsole(Console):
     """A console whose progress bars are also written to the state file of a job."""
 
     def __init__(self, folder: Path, state: JobState) -> None:
-        """Start from `state`; nothing is written yet."""
+        """Start from `state` without writing it."""
         super().__init__()
         self._folder, self.state, self._written = folder, state, 0.0
 
     @contextmanager
     def bar(self, name: str) -> Generator[Progress]:
-        """A progress bar of `Console` that also updates the state file."""
+        """Show the progress bar of `Console` and update the state file."""
         now = time.time()
         self.write(replace(self.state, step=name, done=0, total=0, message="", step_started=now))
         last: tuple[int, int] | None = None
@@ -60,7 +60,7 @@ class JobConsole(Console):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the command; progress, outcome and error are in the state file, and the outcome in the exit status."""
+    """Run the command, write progress, outcome and error to the state file, and return the exit status."""
     folder, title, words = Path(arguments[0]), arguments[1], tuple(arguments[2:])
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     # a shell starts background processes with SIGINT ignored
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str]) -> int:
         lock.release()
 
 
-# what these import is imported late, so that an interruption while torch is loaded is an outcome too
+# imports are local, so that an interruption while torch loads is recorded as an outcome
 
 
 def _run(words: Sequence[str], console: JobConsole) -> tuple[str, ...]:
@@ -110,7 +110,7 @@ def _parsed(command: type[T], words: Sequence[str]) -> T:
 
 
 def _plan(project: Path, out: Path | None, to: str) -> tuple[PlannedStep, ...]:
-    """The steps to be run with their expected durations; empty where the project is invalid."""
+    """List the steps to run with their expected durations; empty if the project is invalid."""
     from splatgraft.workflow.flow import read_flow, reasons
     from splatgraft.workflow.time_estimate import estimate_step_times
 

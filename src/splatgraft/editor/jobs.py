@@ -20,9 +20,9 @@ from splatgraft.runtime.files import atomic_write, writable
 _STATE_FILE, _LOG_FILE, _LOCK_FILE = "job.json", "job.log", "job.lock"
 Outcome = Literal["running", "done", "failed", "cancelled", "killed"]
 _WAIT = 0.02
-"""Seconds between looks at the state file of a job that starts."""
+"""Seconds between reads of the state file while a job starts."""
 _MIN_SPENT = 2.0
-"""Seconds after which a counter's rate is taken for measured."""
+"""Seconds after which a counter's rate is known."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class JobState:
     pid: int
     """Process id; the process leads its own process group."""
     outcome: Outcome
-    """`killed`: the process ended without writing an outcome."""
+    """Outcome; `killed`: the process ended without writing one."""
     started: float
     """Time of the start, seconds since 1970."""
     step: str = ""
@@ -56,7 +56,7 @@ class JobState:
     done: int = 0
     """Finished units of the running step."""
     total: int = 0
-    """Total units of the running step; 0 where not known yet."""
+    """Total units of the running step; 0 if not known yet."""
     message: str = ""
     """Progress message of the step."""
     step_started: float = 0.0
@@ -64,13 +64,13 @@ class JobState:
     begun: int = 0
     """Units that an earlier, killed run had finished when counting began."""
     begun_at: float = 0.0
-    """When counting began, seconds since 1970; a step with several counters begins several times."""
+    """Start of the current counter, seconds since 1970; a step may have several counters."""
     error: str = ""
     """Error message, one line; empty unless the outcome is `failed`."""
     plan: tuple[PlannedStep, ...] = ()
-    """All steps of the job in order; empty where they are not known."""
+    """All steps of the job in order; empty if they are not known."""
     said: tuple[str, ...] = ()
-    """Sentences for the user on what was done; empty before the outcome `done`."""
+    """Sentences for the user about the results; empty before the outcome `done`."""
 
     @property
     def live(self) -> bool:
@@ -84,7 +84,7 @@ class JobState:
 
 
 def seconds_left(state: JobState, now: float) -> float | None:
-    """Seconds until the running step's counter is complete, by the rate since it began; None where it is too early."""
+    """Estimate the seconds until the step's counter is complete from its rate so far; None if it is too early."""
     spent, done = now - state.begun_at, state.done - state.begun
     if not state.live or not 0 < done < state.total - state.begun or spent < _MIN_SPENT:
         return None
@@ -92,7 +92,7 @@ def seconds_left(state: JobState, now: float) -> float | None:
 
 
 def seconds_left_in_job(state: JobState, now: float) -> float | None:
-    """Seconds until the job ends, by the running step's rate or its last duration; None unless all was measured."""
+    """Estimate the seconds until the job ends from measured rates and durations; None if one is missing."""
     names = [step.name for step in state.plan]
     if not state.live or state.step not in names:
         return None
@@ -115,7 +115,7 @@ def write_state(folder: Path, state: JobState) -> None:
 
 
 class Jobs:
-    """At most one job at a time per folder, also across processes."""
+    """The jobs of a folder, at most one at a time, also across processes."""
 
     def __init__(self, folder: Path) -> None:
         """Attach to the job that runs in `folder`, if any."""
@@ -126,7 +126,7 @@ class Jobs:
         """Start a job, and wait until its process has written its first state.
 
         `command` must call `acquire_job_lock` first; `shown` are the arguments of the equivalent `splatgraft` command.
-        ValueError where a job is running already.
+        Raise ValueError if a job is running already.
         """
         state = self.state()
         if state is not None and state.live:
@@ -144,11 +144,11 @@ class Jobs:
             write_state(self.folder, JobState(title, tuple(shown), self._child.pid, "killed", time.time()))
 
     def state(self) -> JobState | None:
-        """The state of the running job, else of the last one; None where there was none."""
+        """Return the state of the running or the last job; None if no job was started."""
         if self._child is not None:
             self._child.poll()
         state = self._read()
-        # the process holds the lock as long as it is alive
+        # the process holds the lock while it is alive
         if state is None or not state.live or _is_locked(self.folder / _LOCK_FILE):
             return state
         state = self._read() or state
@@ -169,13 +169,13 @@ class Jobs:
             found["plan"] = tuple(PlannedStep(**step) for step in found["plan"])
             state = JobState(**found | {name: tuple(found[name]) for name in ("command", "said")})
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            return None  # none yet, or of another version
+            return None  # missing, or of another version
         # a process is signalled by this number: 0 and below would be a group, or all processes
         return state if state.pid > 1 else None
 
 
 def acquire_job_lock(folder: Path) -> filelock.BaseFileLock:
-    """Lock the job folder until the process ends; ValueError where another job holds the lock."""
+    """Lock the job folder until the process ends; raise ValueError if another job holds the lock."""
     lock = filelock.FileLock(folder / _LOCK_FILE)
     try:
         lock.acquire(timeout=0)

@@ -1,4 +1,4 @@
-"""The step `Light`: lights dragged on a picture of the sky or in the view, a sun by two clicks, and strengths."""
+"""The step `Light`: drag lights on a picture of the sky or in the view, set a sun by two clicks, set strengths."""
 
 import math
 from dataclasses import replace
@@ -35,43 +35,43 @@ _LAYERS = (
     ("bounce", "Light onto the place", (0.0, 2.0), "That the object reflects onto its surroundings; 1 is as computed"),
     ("gloss", "Reflections", (0.0, 2.0), "On the object; 1 is as computed"),
 )
-"""Field of `LayerWeights`, label, ends of the slider and hint."""
+"""Fields of `LayerWeights`, with label, ends of the slider and hint."""
 _WEIGHTS = {name for name, _, _, _ in (*_FIRST, *_LAYERS)}
-_SOFTNESS = (0.3, 30.0)  # degrees; the sun's own is .27
+_SOFTNESS = (0.3, 30.0)  # degrees; the sun's is 0.27
 _MAX_SOURCES = 4
-_UNSEEN = 0.5  # share of the directions overhead that were not photographed, from which on the panel says so
+_UNSEEN = 0.5  # share of unphotographed directions overhead above which the panel warns
 _MARK = "#ffc83c"
 
 
 class LightPanel(Panel):
-    """Its controls, and the lights in the view."""
+    """Controls of the light, and the lights in the view."""
 
     def __init__(self, editor: "Editor") -> None:
-        """Take no clicks for the sun yet."""
+        """Start without clicks for the sun."""
         super().__init__(editor)
         self._chosen, self._sets_sun = 0, False
         self._points: tuple[Point, ...] = ()
         self._set_light: Light | None = None
-        """The light when the last point was added; under another one, as after undo, pairs begin anew."""
+        """Light when the last point was added; if it was replaced, for example by undo, pairs begin anew."""
         self._full: tuple[tuple[float, float, float], ...] = ()
-        """Irradiance of each source at a strength of 1: what it was before the slider changed it."""
+        """Irradiance of each source at a strength of 1, before the slider changed it."""
         self._scaled: tuple[LightSource, ...] | None = None
-        """The sources that the slider made last."""
+        """Sources after the last change by the slider."""
         self._dome: SkyDome | None = None
-        """How the picture of the sky is turned."""
+        """Orientation of the picture of the sky."""
         self._handle: tuple[int, Corner] | None = None
 
     def enter(self) -> None:
-        """Show the light, which follows the edits."""
+        """Show the new light instead of the result."""
         if self.editor.kind == "Result":
             self.editor.kind = "With its new light"
 
     def leave(self) -> None:
-        """Take no more clicks."""
+        """End drags and clicks for the sun."""
         self._sets_sun, self._handle = False, None
 
     def build(self, form: Form) -> None:
-        """Describe the light, and how strong its parts are."""
+        """Add the controls of the light and its strengths."""
         session = self.editor.require_session()
         light = self._light(session)
         if light is None:
@@ -130,12 +130,12 @@ class LightPanel(Panel):
         form.slider("strength", "Strength", strength, (0.0, 3.0, 0.05), self._scale)
 
     def _weight(self, form: Form, name: str, label: str, ends: tuple[float, float, float], hint: str) -> None:
-        """The slider of one of the layers' weights."""
+        """Add the slider of a layer's weight."""
         weight = getattr(self.editor.require_session().state.weights, name)
         form.slider(name, label, weight, ends, lambda value: self._set_weight(name, value), hint=hint)
 
     def _light(self, session: Session) -> Light | None:
-        """The light of a drag, that set by hand, or the last estimate."""
+        """Return the light of a drag, the light set by hand, or the last estimate."""
         state = self.editor.live or session.placed_state()
         if not session.objects() or not session.files.transfers_light:
             return None
@@ -148,7 +148,7 @@ class LightPanel(Panel):
         return found
 
     def _missing(self, session: Session) -> str:
-        """Why there is no light to show."""
+        """Return the reason why no light is shown."""
         if not session.files.transfers_light:
             return "The light transfer is off in project.toml: the object is shown as it was captured."
         if not session.objects():
@@ -159,7 +159,7 @@ class LightPanel(Panel):
     # strengths
 
     def live(self, name: str, value: Any) -> None:
-        """Show a strength while its slider is dragged."""
+        """Show a strength or a direction while it is dragged."""
         if name == "sky":
             self._drag_on_sky(value)
         elif name in _WEIGHTS:
@@ -176,7 +176,7 @@ class LightPanel(Panel):
         self._change(lambda source: replace(source, irradiance=(r, g, b)), keeps_strength=True)
 
     def _change(self, change: Any, *, keeps_strength: bool = True) -> None:
-        """Change the chosen source; the strengths stay relative to what they were."""
+        """Change the chosen source; strengths stay relative to `_full`."""
         session = self.editor.require_session()
         light = self._light(session)
         if light is not None and light.sources:
@@ -188,7 +188,7 @@ class LightPanel(Panel):
     # directions
 
     def _drag_on_sky(self, given: tuple[int, float, float, bool]) -> None:
-        """Move a light on the picture of the sky, to x and y over the horizon's radius."""
+        """Move a light on the picture of the sky, to x and y in units of the horizon's radius."""
         index, x, y, is_end = given
         session, dome = self.editor.require_session(), self._dome
         light = self._light(session)
@@ -198,7 +198,7 @@ class LightPanel(Panel):
         self._move(with_direction(light, index, dome.direction(x, y)), ended=is_end)
 
     def _move(self, light: Light, *, ended: bool) -> None:
-        """Show a light whose source is being dragged, and save it at the end, as one undo step."""
+        """Show a light during a drag, and save it at the end in one undo step."""
         session = self.editor.require_session()
         edited = replace(session.placed_state(), light=light)
         check_state(edited)
@@ -209,7 +209,7 @@ class LightPanel(Panel):
             self.editor.show_live(edited)
 
     def overlay(self, view: View, camera: Cameras) -> dict[str, Any]:
-        """Arrows of the lights, and the points that set the sun."""
+        """Describe the arrows of the lights and the points that set the sun."""
         session = self.editor.require_session()
         light = self._light(session)
         if light is None or self.editor.kind != "With its new light":
@@ -231,7 +231,7 @@ class LightPanel(Panel):
         return {"lines": lines, "dots": dots}
 
     def _centre_and_length(self, session: Session) -> tuple[Float[Tensor, "3"], float]:
-        """Where the arrows point, and how far away they begin."""
+        """Return the arrows' target, and the distance of their tails from it."""
         base, placed = session.placeable_object(0).base, session.objects()[0].target_from_object
         length = 3.0 * placed.scale * max(base.height, base.radius)
         return placed.points(base.point + 0.5 * base.height * base.up), length
@@ -258,7 +258,7 @@ class LightPanel(Panel):
             self._add_point(view, pointer)
 
     def key(self, view: View, key: str) -> bool:
-        """Escape ends the clicks for the sun."""
+        """End the clicks for the sun on Escape."""
         if key == "escape":
             self._sets_sun = False
         return key == "escape"
@@ -266,7 +266,7 @@ class LightPanel(Panel):
     # the sun by two clicks
 
     def _kept(self) -> tuple[Point, ...]:
-        """The points that still hold."""
+        """Return the points set under the current light."""
         return self._points if self.editor.require_session().state.light is self._set_light else ()
 
     def _toggle_sun(self, value: bool) -> None:
@@ -309,13 +309,13 @@ class LightPanel(Panel):
 
 
 def arrow_points(source: LightSource, centre: Float[Tensor, "3"], length: float) -> Float[Tensor, "2 3"]:
-    """Tail and head of the arrow of a source: from `length` away towards `centre`, ending at 0.3 `length`."""
+    """Return tail and head of a source's arrow, at distances `length` and 0.3 `length` from `centre`."""
     direction = torch.tensor(source.direction)
     return torch.stack([centre + length * direction, centre + 0.3 * length * direction])
 
 
 def with_direction(light: Light, index: int, towards: Float[Tensor, "3"]) -> Light:
-    """The light with one source's direction set by hand, hence without uncertainty and without measured blockers."""
+    """Set one source's direction by hand, which removes its uncertainty and measured blockers."""
     length = float(towards.norm())
     if length < 1e-9:
         return light
@@ -326,5 +326,5 @@ def with_direction(light: Light, index: int, towards: Float[Tensor, "3"]) -> Lig
 
 
 def with_source(light: Light, index: int, source: LightSource) -> Light:
-    """The light with another source in place of one."""
+    """Return the light with one source replaced."""
     return replace(light, sources=(*light.sources[:index], source, *light.sources[index + 1 :]))

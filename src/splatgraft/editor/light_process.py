@@ -1,7 +1,7 @@
-"""The light of the edited scene, computed in a process of its own, so that no picture waits for it.
+"""The light of the edited scene, computed in a child process, so that pictures do not wait for it.
 
-The editor sends states. Back come the layers of the light transfer: a draft first, then, if it is wanted, those of the
-step `relight`.
+The editor sends states. The process returns the layers of the light transfer: first a draft, then, if requested, those
+of the step `relight`.
 """
 
 import contextlib
@@ -28,13 +28,13 @@ from splatgraft.relighting import Relit
 
 Stage = Literal["draft", "refined", "final"]
 Wanted = Literal["prepared", "draft", "final"]
-"""What is asked for: that drafts are prepared while nothing else is to be done, a draft, or a draft and the light."""
+"""Kinds of requests: prepare drafts when idle, compute a draft, or compute a draft and the final light."""
 _START = "import sys; from splatgraft.editor import light_process; light_process.main(sys.argv[1:])"
-"""What the process runs; a module that is run by its name would answer with classes that the editor does not know."""
+"""Code that the process runs; `python -m` would pickle classes of `__main__`, which the editor cannot load."""
 _FIELDS = ("objects", "erased", "light")
-"""What the light depends on in an `EditState`."""
-_SETTLE_SECONDS = 0.25  # time without a change before the light, or a draft during a drag, is begun
-_REMEMBERED = 500  # states that were asked for; in a drag each picture asks for one, and a draft may take long
+"""Fields of `EditState` on which the light depends."""
+_SETTLE_SECONDS = 0.25  # time without a change before the light, or a draft during a drag, starts
+_REMEMBERED = 500  # stored requests; each picture of a drag makes one, and a draft may take long
 _NICE = 5  # priority below that of pictures
 
 
@@ -43,15 +43,15 @@ class Lit:
     """Layers of the light transfer for one state."""
 
     stage: Stage
-    """A draft, all layers under the sources found before a move, or the step's own result."""
+    """Draft, all layers with the sources found before a move, or the step's result."""
     relit: Relit
-    """The layers; those of a draft come without their Gaussians, which are those of the composite."""
+    """Layers; a draft omits its Gaussians, which are those of the composite."""
     seconds: float
-    """How long they took."""
+    """Computation time."""
 
 
 class LightProcess:
-    """The editor's side: it asks for the light of the newest state, and hears of each result."""
+    """The editor's side, which requests the light of the newest state and receives the results."""
 
     def __init__(
         self, project: Project, on_lit: Callable[[EditState, Lit], None], on_error: Callable[[str], None]
@@ -66,7 +66,7 @@ class LightProcess:
         self._lock = threading.Lock()
 
     def want(self, state: EditState, wanted: Wanted) -> None:
-        """Ask for the light of a state, in place of what was asked before; nothing where it was asked for already."""
+        """Request the light of a state in place of the last request, unless it was requested already."""
         with self._lock:
             latest = self._asked.get(self._number)
             is_same = latest is not None and all(getattr(latest, name) is getattr(state, name) for name in _FIELDS)
@@ -77,7 +77,7 @@ class LightProcess:
                 self._start()
             assert self._child is not None
             assert self._child.stdin is not None
-            # tensors that are sent once are the same objects on the other side, whose memos then hold
+            # unchanged tensors are not sent again, because the process's memos compare inputs by identity
             changed = {
                 name: getattr(state, name) for name in _FIELDS if self._sent.get(name, self) is not getattr(state, name)
             }
@@ -125,12 +125,12 @@ class LightProcess:
                     self._on_lit(state, result)
         with self._lock:
             if child is self._child:
-                # what it was asked last is asked again
+                # the next `want` repeats the last request
                 self._asked, self._wanted = {}, None
 
 
 class _Computing:
-    """The other side: two threads, so that a draft does not wait for the light of an earlier state."""
+    """The process's side: two threads, so that a draft does not wait for the light of an earlier state."""
 
     def __init__(self, project: Project, out: IO[bytes]) -> None:
         self._stamps = stamps_of(project.file)
@@ -155,7 +155,7 @@ class _Computing:
 
     def _draft(self, asked: tuple[int, EditState, Wanted]) -> None:
         number, state, wanted = asked
-        # the layers of a place that a drag has left would only delay the pictures and the next draft
+        # the layers of an outdated placement would delay the pictures and the next draft
         if wanted != "final" and not self._drafts.wait_idle(_SETTLE_SECONDS):
             return
         if wanted == "prepared":
@@ -181,7 +181,7 @@ class _Computing:
             self._relighting.prepare_drafts(state)
 
     def _send(self, number: int, stage: Stage, relit: Relit, start: float) -> None:
-        # what only the step writes stays here; the Gaussians of a draft, none of which is split, the editor has
+        # drop fields that only the step writes, and a draft's Gaussians: none is split, so the editor has them
         shown = replace(relit, estimate=None, received=(), prepared=())
         if stage == "draft":
             shown = replace(shown, gaussians=shown.gaussians.select(torch.zeros(0, dtype=torch.int64)))
@@ -194,8 +194,8 @@ class _Computing:
 
 
 def main(arguments: list[str]) -> None:
-    """Answer until the input ends."""
-    # what is printed must not mix with the answers
+    """Answer requests until the input ends."""
+    # printed text must not mix with the answers
     answers, sys.stdout = os.fdopen(os.dup(1), "wb"), sys.stderr
     os.dup2(2, 1)
     if hasattr(os, "nice"):
@@ -215,7 +215,7 @@ def _write(stream: IO[bytes], message: object) -> None:
 
 
 def _read(stream: IO[bytes]) -> Any:
-    """The next message of the other process, which this program started; None at the end."""
+    """Read the next message, which this program pickled itself; None at the end."""
     head = stream.read(8)
     content = stream.read(int.from_bytes(head, "little")) if len(head) == 8 else b""
     return pickle.loads(content) if content else None

@@ -1,4 +1,4 @@
-"""The step `Open`: create a project of two captures or scenes, and reconstruct the scenes that are missing."""
+"""The step `Open`: create a project from two captures or scenes, and reconstruct missing scenes."""
 
 from functools import partial
 from pathlib import Path
@@ -42,19 +42,19 @@ _UPS: dict[str, Triple | None] = {
 }
 _LOOKS = {"from around": False, "from within": True}
 _TRAINED_HINT = "A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
-_MAX_ROWS = 300  # entries of a folder that are listed
+_MAX_ROWS = 300  # listed entries of a folder
 
 
 class OpenPanel(Panel):
-    """Its controls."""
+    """Controls of a new project or the open one."""
 
     def __init__(self, editor: "Editor") -> None:
-        """Name no capture yet."""
+        """Start without captures."""
         super().__init__(editor)
         self._paths = dict.fromkeys(_FIELDS, "")
         self._found: dict[str, InputDescription | None] = dict.fromkeys(_SIDES)
         self._browsed: tuple[str, Path] | None = None
-        """The field for which a folder of this machine is shown, and that folder."""
+        """Field for which a folder of this machine is shown, and that folder."""
         self._looker = LatestOnlyWorker(self._look, lambda error: editor.say(str(error), bad=True))
 
     def close(self) -> None:
@@ -62,7 +62,7 @@ class OpenPanel(Panel):
         self._looker.close()
 
     def build(self, form: Form) -> None:
-        """Describe a new project, or the facts of the open one."""
+        """Add the controls of a new project, or those of the open one."""
         session, problem = self.editor.session, self.editor.problem
         if problem is not None:
             form.note(f"This project cannot be opened: {problem}", name="problem", bad=True)
@@ -103,7 +103,7 @@ class OpenPanel(Panel):
         form.hidden(f"browse_{name}", lambda: setattr(self, "_browsed", (name, start)))
 
     def _build_folder(self, form: Form, name: str, folder: Path) -> None:
-        """The folders and usable files of one folder of this machine."""
+        """List the folders and usable files of a folder of this machine."""
 
         def go(row: str) -> None:
             path = folder.parent if row == ".." else folder / row.removesuffix("/")
@@ -139,7 +139,7 @@ class OpenPanel(Panel):
             self._looker.submit(dict(self._paths))
 
     def _look(self, paths: dict[str, str]) -> None:
-        """Say what the paths are, before anything is made of them."""
+        """Describe the inputs at the paths."""
         for name in _SIDES:
             self._found[name] = describe_input(parse_path(paths[name])) if paths[name] else None
         self.editor.refresh()
@@ -158,7 +158,7 @@ class OpenPanel(Panel):
             self.editor.say("the project is made; reconstruct both scenes next")
 
     def uploaded(self, path: Path, use: str) -> None:
-        """Name an uploaded file, or the folder of uploaded photos."""
+        """Use an uploaded file, or the folder of uploaded photos, as a capture."""
         name = use.removeprefix("upload_")
         if name in _SIDES and self.editor.session is None:
             self._set(name, str(path.parent if path.suffix.lower() in _PHOTOS else path))
@@ -181,7 +181,7 @@ class OpenPanel(Panel):
                 self._build_views(form, side, files.rendered_views[index])
 
     def _build_views(self, form: Form, side: Side, views: RenderedViews) -> None:
-        """How images of a scene without photographs are rendered; an up along no axis is an option of its own."""
+        """Add the choices for rendering a scene without photographs; an up along no axis is an extra option."""
         ups = dict(_UPS)
         if views.up not in ups.values():
             ups[f"({', '.join(f'{x:g}' for x in views.up or ())})"] = views.up
@@ -218,7 +218,7 @@ class OpenPanel(Panel):
 
 
 def parse_path(text: str) -> Path:
-    """The path that a text field names; ValueError where it is empty."""
+    """Return the path in a text field; raise ValueError if it is empty."""
     if not text.strip():
         raise ValueError("path: expected one, found nothing")
     return Path.cwd() / Path(text.strip()).expanduser()

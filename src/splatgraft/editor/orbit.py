@@ -1,4 +1,4 @@
-"""A window's camera: it turns around a point, and stays above the support and in front of walls."""
+"""A window's camera, which turns around a point above the support and in front of walls."""
 
 import math
 from dataclasses import dataclass, replace
@@ -14,32 +14,32 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.picking import first_surface_hit
 
 Vector = Float[np.ndarray, "3"]
-_STEEPEST = math.radians(88.0)  # angle of the line of sight to the horizontal; up has no meaning at 90
+_STEEPEST = math.radians(88.0)  # angle of the line of sight to the horizontal; up is undefined at 90 degrees
 _TURN = 2 * math.pi  # radians for a drag over the canvas's height
 _NEAREST, _FARTHEST = 1e-3, 1e3  # distances to the pivot over the typical one of the scene
 _CLEAR = 0.03  # height above the support over the typical distance
-_BEFORE_WALL = 0.93  # a camera that would be in or behind a wall stands at this share of the way to it
-_FREE = 0.6  # distance from the pivot over the typical one within which nothing is a wall: a cup may stand there
-_SURFACES = 20_000  # Gaussians that count as walls, the ones that cover most
-_FRAMED = 1.5  # distance over which an object fills two thirds of the height
+_BEFORE_WALL = 0.93  # fraction of the way to a wall at which a camera is placed that would be in or behind it
+_FREE = 0.6  # surfaces nearer to the pivot are objects, not walls; over the typical distance
+_SURFACES = 20_000  # number of Gaussians used as walls, those with the largest coverage
+_FRAMED = 1.5  # distance over the one at which an object fills the height
 
 
 @dataclass(frozen=True)
 class Orbit:
-    """A view: where it stands, and the point around which it turns."""
+    """A camera pose, and the point around which it turns."""
 
     world_from_camera: Float[np.ndarray, "4 4"]
     """Pose, OpenCV axes."""
     distance: float
-    """To the point around which it turns, along the optical axis, world units."""
+    """Distance to the pivot along the optical axis, world units."""
     half_height: float
     """Tangent of half the vertical field of view."""
     aspect: float = 0.0
-    """Width over height of a picture that must be visible as a whole; 0: any."""
+    """Width over height of a picture that must be fully visible; 0: none."""
 
     @property
     def position(self) -> Vector:
-        """Where the camera is."""
+        """Camera position."""
         return self.world_from_camera[:3, 3]
 
     @property
@@ -49,11 +49,11 @@ class Orbit:
 
     @property
     def pivot(self) -> Vector:
-        """The point around which the view turns."""
+        """Point around which the view turns."""
         return self.position + self.distance * self.forward
 
     def camera(self, width: int, height: int) -> Cameras:
-        """The camera for a canvas, in whose middle the whole picture is."""
+        """Return the camera of a canvas with the whole picture in its middle."""
         half = self.half_height * max(1.0, self.aspect * height / width if self.aspect else 1.0)
         focal = height / (2 * half)
         intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
@@ -61,7 +61,7 @@ class Orbit:
         return Cameras(pose[None], intrinsics[None], torch.tensor([[width, height]]), ("window",))
 
     def turned(self, dx: float, dy: float, *, up: Vector) -> "Orbit":
-        """Turn around the pivot by a drag over the canvas's height."""
+        """Turn around the pivot by a drag in units of the canvas's height."""
         level = math.asin(float(np.clip(self.forward @ up, -1, 1)))
         wanted = float(np.clip(level - 0.5 * _TURN * dy, -_STEEPEST, _STEEPEST))
         ahead = self.forward - (self.forward @ up) * up
@@ -73,7 +73,7 @@ class Orbit:
         return self.looking(self.pivot, math.cos(wanted) * ahead + math.sin(wanted) * up, self.distance, up=up)
 
     def moved(self, dx: float, dy: float) -> "Orbit":
-        """Move sideways by a drag over the canvas's height, so that the pivot's plane follows the pointer."""
+        """Move sideways by a drag in units of the canvas's height; the pivot's plane follows the pointer."""
         shift = (
             -2
             * self.half_height
@@ -92,13 +92,13 @@ class Orbit:
         return replace(self, world_from_camera=pose, distance=distance)
 
     def framing(self, sphere: BoundingSphere, *, up: Vector) -> "Orbit":
-        """The view of a sphere that fills two thirds of the height, from the direction that it has."""
+        """Look at a sphere from the present position's side; it fills two thirds of the height."""
         center = sphere.center.double().numpy()
         distance = _FRAMED * sphere.radius / math.sin(math.atan(self.half_height))
         return self.looking(center, center - self.position, distance, up=up)
 
     def looking(self, pivot: Vector, direction: Vector, distance: float, *, up: Vector) -> "Orbit":
-        """The view of a point along a direction."""
+        """Return the view of a point along a direction."""
         forward = _unit(direction)
         right = np.cross(forward, up)
         if np.linalg.norm(right) < 1e-6:
@@ -111,14 +111,14 @@ class Orbit:
 
 
 def through(camera: Cameras, distance: float) -> Orbit:
-    """The view through a camera of a capture, which shows its whole picture however narrow the canvas is."""
+    """Return the view of a capture's camera, which shows the whole picture on a canvas of any shape."""
     half_height = camera.height / (2 * float(camera.intrinsics[0, 1, 1]))
     return Orbit(camera.world_from_camera[0].double().numpy(), distance, half_height, camera.width / camera.height)
 
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """Where a camera may be: above the support, and not in or behind a wall."""
+    """Permitted camera positions: above the support, and not in or behind a wall."""
 
     up: Vector
     """Unit up direction."""
@@ -131,7 +131,7 @@ class FreeSpace:
 
     @staticmethod
     def of(scene: Gaussians, cameras: Cameras, up: Float[Tensor, "3"], foot: Float[Tensor, "3"] | None) -> "FreeSpace":
-        """The space of a scene; below the foot of an object a camera may be only as deep as the photos were taken."""
+        """Return a scene's free space, down to the lowest photo or just above `foot`, whichever is lower."""
         heights = cameras.centers @ up
         floor, scale = float(heights.min()), typical_distance(cameras)
         if foot is not None:
@@ -141,7 +141,7 @@ class FreeSpace:
         return FreeSpace(up.double().numpy(), floor, scene.select(chosen).with_sh_degree(0), scale)
 
     def kept(self, view: Orbit) -> Orbit:
-        """The view, or one from the nearest place on the way to its pivot where a camera may be."""
+        """Return the view, moved in front of walls and above the floor if necessary."""
         pivot, back = view.pivot, -view.forward
         distance = view.distance
         ray = torch.tensor(back).float()
@@ -156,7 +156,7 @@ class FreeSpace:
         if short <= 0:
             return view if distance == view.distance else view.looking(pivot, -back, distance, up=self.up)
         if float(pivot @ self.up) >= self.floor:
-            # the same distance, less deep
+            # raised to the floor, still aimed at the pivot
             place = place + short * self.up
             return view.looking(pivot, pivot - place, float(np.linalg.norm(pivot - place)), up=self.up)
         pose = view.world_from_camera.copy()
@@ -165,7 +165,7 @@ class FreeSpace:
 
 
 def typical_distance(cameras: Cameras) -> float:
-    """Median distance of camera centres from their mean, world units; positive."""
+    """Compute the median distance of camera centres from their mean, world units; positive."""
     return max(1e-6, float((cameras.centers - cameras.centers.mean(0)).norm(dim=1).median()))
 
 

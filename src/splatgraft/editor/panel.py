@@ -1,4 +1,4 @@
-"""What all steps of the editor have in common: a panel, a picture, what lies over it, and what the pointer does."""
+"""The base of the editor's steps: a panel, a picture with its overlay, and actions of the pointer."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
 
 CORNERS = ("lower", "upper")
 """Names of the dots by which a box is dragged."""
-_SHORTEST = 1e-4  # of a dragged box's edges over the longest, so that it keeps a volume
+_SHORTEST = 1e-4  # shortest edge of a dragged box over its longest; the volume stays positive
 _BOX_EDGES = [(i, j) for i in range(8) for j in range(i) if bin(i ^ j).count("1") == 1]
 
 
 @dataclass(frozen=True)
 class Pointer:
-    """What the pointer did on the canvas."""
+    """An action of the pointer on the canvas."""
 
     what: str
-    """down, move, up, cancel, click, or rectangle."""
+    """Kind: down, move, up, cancel, click, or rectangle."""
     x: float
-    """Place over the canvas's width."""
+    """Position over the canvas's width."""
     y: float
-    """Place over its height."""
+    """Position over its height."""
     on: str = ""
-    """What it held at the start: an object or a dot by its name, or nothing."""
+    """Name of the object or dot that was grabbed; empty if there was none."""
     mode: str = "move"
-    """How an object is dragged."""
+    """Drag mode of an object."""
     alt: bool = False
     """Whether Alt or the right button was held."""
     shift: bool = False
@@ -50,9 +50,9 @@ class Pointer:
 
     @staticmethod
     def of(message: dict[str, Any]) -> Pointer:
-        """Check what a browser sent; ValueError, KeyError or TypeError where no page sends it."""
+        """Parse a browser's message; raise ValueError, KeyError or TypeError if it is invalid."""
         x, y, u, v = (float(message.get(name, 0.0)) for name in ("x", "y", "u", "v"))
-        # a pointer may leave the canvas, and no number is too large for a message
+        # a pointer may leave the canvas, and a message may hold any number
         if not all(-10 < value < 10 for value in (x, y, u, v)):
             raise ValueError("pointer: expected a place near the canvas, found another")
         words = [message.get(name, "") for name in ("what", "on", "mode")]
@@ -62,11 +62,11 @@ class Pointer:
 
     @property
     def place(self) -> tuple[float, float]:
-        """Where it is, over the canvas's sides."""
+        """Position over the canvas's sides."""
         return self.x, self.y
 
     def ray(self, camera: Cameras) -> Ray:
-        """The ray through it."""
+        """Return the ray through the pointer."""
         k, pose = camera.intrinsics[0], camera.world_from_camera[0]
         pixel = torch.tensor([self.x * camera.width, self.y * camera.height, 1.0])
         return Ray(pose[:3, 3], pose[:3, :3] @ (torch.linalg.inv(k) @ pixel))
@@ -76,39 +76,39 @@ class Panel:
     """One step of the workflow."""
 
     def __init__(self, editor: Editor) -> None:
-        """Belong to an editor."""
+        """Attach to an editor."""
         self.editor = editor
 
     def enter(self) -> None:
-        """Begin what holds while the step is shown."""
+        """Set up the step when it is shown."""
 
     def leave(self) -> None:
-        """End it."""
+        """Clean up when the step is left."""
 
     def close(self) -> None:
         """End all threads."""
 
     def build(self, form: Form) -> None:
-        """Describe the controls for the present state."""
+        """Add the controls for the current state."""
         raise NotImplementedError
 
     def tools(self) -> dict[str, Any]:
-        """What the page offers on the canvas: `tools`, `paint`, `rectangle`."""
+        """Return the tools for the canvas: `tools`, `paint`, `rectangle`."""
         return {}
 
     def picture(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
-        """The picture of a view, and its caption."""
+        """Draw a view, and return the picture and its caption."""
         return self.editor.draw_target(view, camera)
 
     def overlay(self, view: View, camera: Cameras) -> dict[str, Any]:
-        """What the page draws over it: `hulls`, `lines` and `dots`."""
+        """Describe the overlay: `hulls`, `lines` and `dots`."""
         return {}
 
     def pointer(self, view: View, pointer: Pointer) -> None:
-        """Take what the pointer did."""
+        """Handle an action of the pointer."""
 
     def key(self, view: View, key: str) -> bool:
-        """Take a key; whether it has a meaning here."""
+        """Handle a key; return whether this step uses it."""
         return False
 
     def live(self, name: str, value: Any) -> None:
@@ -118,11 +118,11 @@ class Panel:
         """Use a file that was uploaded for a control."""
 
     def job_ended(self, job: JobState) -> None:
-        """Update what depends on a job that has ended; called for all steps."""
+        """Update the step after a job has ended; called for all steps."""
 
 
 def view_camera(editor: Editor, view: View) -> Cameras:
-    """The camera of a window's full picture."""
+    """Return the camera of a window's full picture."""
     orbit = editor.orbit(view)
     if orbit is None or not all(view.size):
         raise ValueError("view: expected a scene in view, found none")
@@ -130,7 +130,7 @@ def view_camera(editor: Editor, view: View) -> Cameras:
 
 
 class BoxDrag:
-    """A box of which the pointer drags a corner, `lower` or `upper`, at its depth in a view."""
+    """A box whose corner, `lower` or `upper`, is dragged at its depth in a view."""
 
     def __init__(self, box: Box, corner: str, camera: Cameras) -> None:
         """Grab a corner."""
@@ -138,7 +138,7 @@ class BoxDrag:
         self._corner = Corner(box.lower if self._is_lower else box.upper, camera)
 
     def at(self, place: tuple[float, float]) -> Box:
-        """The box with the corner under the pointer."""
+        """Return the box with the corner under the pointer."""
         corner = self._corner.at(place)
         ends = (corner, self._box.upper) if self._is_lower else (self._box.lower, corner)
         lower, upper = torch.minimum(*ends), torch.maximum(*ends)
@@ -146,7 +146,7 @@ class BoxDrag:
 
 
 def box_over(box: Box, camera: Cameras, color: str) -> dict[str, Any]:
-    """The edges of a box and its two corners, over a picture."""
+    """Describe the edges of a box and its two corners as an overlay."""
     at = on_canvas(box.corners, camera)
     ends = on_canvas(torch.stack([box.lower, box.upper]), camera)
     return {

@@ -1,4 +1,4 @@
-"""A photo of a capture on the canvas, and the clicks in it that say what is the object and what is not."""
+"""A photo of a capture on the canvas, with clicks on the object and beside it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,33 +14,33 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.prompts import ViewPrompt
 
 _NEAR = 0.012
-"""A click this near to a point removes it; distance over the photo's longer side."""
+"""A click within this distance of a point, over the photo's longer side, removes it."""
 _BACKGROUND = 24
 """Grey beside the photo, 0 to 255."""
 
 
 @dataclass(frozen=True)
 class PhotoView:
-    """A photo in the middle of a canvas, as large as it fits."""
+    """A photo in the middle of a canvas, as large as possible."""
 
     photo: tuple[int, int]
-    """Width and height of the photo as a viewer shows it, pixels."""
+    """Width and height of the upright photo, pixels."""
     canvas: tuple[int, int]
     """Width and height of the canvas, pixels."""
 
     @property
     def scale(self) -> float:
-        """Pixels of the canvas over those of the photo."""
+        """Canvas pixels for each photo pixel."""
         return min(self.canvas[0] / self.photo[0], self.canvas[1] / self.photo[1])
 
     @property
     def corner(self) -> tuple[float, float]:
-        """The photo's upper left corner on the canvas, pixels."""
+        """Upper left corner of the photo on the canvas, pixels."""
         x, y = (0.5 * (side - self.scale * of) for side, of in zip(self.canvas, self.photo, strict=True))
         return x, y
 
     def pixel_at(self, place: tuple[float, float]) -> tuple[float, float] | None:
-        """The photo's pixel at a place, over the canvas's width and height; None beside the photo."""
+        """Return the photo's pixel at a position over the canvas's sides; None beside the photo."""
         (left, top), (width, height) = self.corner, self.photo
         x, y = (place[0] * self.canvas[0] - left) / self.scale, (place[1] * self.canvas[1] - top) / self.scale
         return (x, y) if 0 <= x < width and 0 <= y < height else None
@@ -53,7 +53,7 @@ class PhotoView:
         return min(width, self.canvas[0] - left), min(height, self.canvas[1] - top)
 
     def drawn(self, pixels: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "y x 3"]:
-        """The canvas with the photo, which is given in any size."""
+        """Draw the canvas with the photo, which may have any size."""
         left, top = (round(x) for x in self.corner)
         width, height = self.drawn_size
         out = np.full((self.canvas[1], self.canvas[0], 3), _BACKGROUND, np.uint8)
@@ -61,13 +61,13 @@ class PhotoView:
         return out
 
     def place_of(self, x: float, y: float) -> tuple[float, float]:
-        """The place of a photo's point, given over its sides, over the canvas's width and height."""
+        """Convert a point over the photo's sides to a position over the canvas's sides."""
         (left, top), (width, height) = self.corner, self.photo
         return (left + self.scale * x * width) / self.canvas[0], (top + self.scale * y * height) / self.canvas[1]
 
 
 def prompt_of(prompts: Mapping[str, ViewPrompt] | None, name: str) -> ViewPrompt:
-    """What is said in one photo; nothing where it is not named."""
+    """Return the prompt of one photo; empty if it has none."""
     return (prompts or {}).get(_key(prompts or {}, name), ViewPrompt())
 
 
@@ -79,9 +79,9 @@ def with_click(
     on_object: bool,
     longer_side: int,
 ) -> dict[str, ViewPrompt] | None:
-    """The prompts with one more point, or without the point that was clicked; None where none is left.
+    """Add a point to the prompts, or remove the point that was clicked; None if no prompt is left.
 
-    `pixel` is x and y of the photo of that name as a viewer shows it, whose `longer_side` is in pixels.
+    `pixel` is x and y in the upright photo of that name, whose `longer_side` is in pixels.
     """
     found, key = dict(prompts or {}), _key(prompts or {}, name)
     prompt, point = found.get(key, ViewPrompt()), torch.tensor([pixel]).round(decimals=1)
@@ -100,9 +100,9 @@ def with_click(
 def seen_best(
     point: Float[Tensor, "3"], direction: Float[Tensor, "3"], cameras: Cameras
 ) -> tuple[int, tuple[float, float]]:
-    """The camera that sees a point most nearly along a direction, and its pixel there.
+    """Find the camera that sees a point most nearly along a direction, and the point's pixel.
 
-    ValueError where no camera has the point in its picture. What stands before the point is not regarded.
+    Occlusion is ignored. Raise ValueError if no camera has the point in its picture.
     """
     local = torch.einsum("vij,vj->vi", cameras.camera_from_world[:, :3, :3], point - cameras.centers)
     pixels = torch.einsum("vij,vj->vi", cameras.intrinsics, local)
@@ -118,6 +118,6 @@ def seen_best(
 
 
 def _key(prompts: Mapping[str, ViewPrompt], name: str) -> str:
-    """How the prompts call a photo: by its name, with or without folder and suffix."""
+    """Return a photo's key in the prompts: its name, with or without folder and suffix."""
     path = PurePath(name)
     return next((key for key in (name, path.name, path.stem) if key in prompts), name)

@@ -26,7 +26,7 @@ class Rectangle:
 
 
 def in_rectangle(means: Float[Tensor, "n 3"], camera: Cameras, rectangle: Rectangle) -> Bool[Tensor, "n"]:
-    """Which centres project into the rectangle in one camera, occluded ones included."""
+    """Flag the centres that project into the rectangle in one camera, even occluded ones."""
     pixels, depth = camera.project(means)
     share = pixels / camera.sizes[0].to(means)
     inside = (share >= torch.tensor(rectangle.lower)) & (share <= torch.tensor(rectangle.upper))
@@ -36,7 +36,7 @@ def in_rectangle(means: Float[Tensor, "n 3"], camera: Cameras, rectangle: Rectan
 def first_surface_hit(
     gaussians: Gaussians, origin: Float[Tensor, "3"], direction: Float[Tensor, "3"]
 ) -> Float[Tensor, "3"] | None:
-    """The point on a ray where accumulated opacity exceeds one half; None where it never does.
+    """Find the point on a ray where accumulated opacity exceeds one half; None if it never does.
 
     Each Gaussian contributes its opacity at the point of the ray where its density is largest (3DGS, Eq. 3).
     """
@@ -59,10 +59,10 @@ def first_surface_hit(
 
 
 def in_brush(gaussians: Gaussians, centre: Float[Tensor, "3"], radius: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians a spherical brush touches.
+    """Flag the Gaussians that a spherical brush touches.
 
-    A Gaussian counts as a ball with its median scale as radius, at most the brush's radius: a narrow brush then does
-    not miss wide Gaussians between their centres, and a wide brush does not take the background.
+    A Gaussian counts as a ball with its median scale as radius, at most the brush's radius. A narrow brush then does
+    not miss wide Gaussians between their centres, and a wide brush does not select the background.
     """
     extent = gaussians.scales.median(1).values.clamp_max(radius)
     return (gaussians.means - centre).norm(dim=1) <= radius + extent
@@ -79,7 +79,7 @@ class Ray:
 
 
 def brush_selection(gaussians: Gaussians, rays: Sequence[Ray], *, size: float) -> Bool[Tensor, "n"]:
-    """Which Gaussians a stroke selects; `size` is the diameter of the brush over the distance of the hit point."""
+    """Flag the Gaussians in a stroke; `size` is the diameter of the brush over the distance of the hit point."""
     selected = torch.zeros(gaussians.count, dtype=torch.bool)
     for ray in rays:
         hit = first_surface_hit(gaussians, ray.origin, ray.direction)
@@ -89,7 +89,7 @@ def brush_selection(gaussians: Gaussians, rays: Sequence[Ray], *, size: float) -
 
 
 def interpolate_rays(start: Ray, end: Ray, *, size: float) -> list[Ray]:
-    """Rays after `start` up to `end`, at most a quarter of the brush's diameter `size` apart."""
+    """Return rays after `start` up to `end`, at most a quarter of the brush's diameter `size` apart."""
     a, b = (torch.nn.functional.normalize(ray.direction, dim=0) for ray in (start, end))
     count = max(1, math.ceil(float((b - a).norm()) / (0.25 * size)))
     return [Ray(end.origin, a + (b - a) * (step + 1) / count) for step in range(count)]

@@ -1,6 +1,6 @@
-"""Pictures of the edited scene by splatgraft's renderer, lit by the newest layers that there are.
+"""Pictures of the edited scene by splatgraft's renderer, lit by the newest available layers.
 
-An object that was moved since keeps the colours of its last lit place, over a contact shadow of its footprint.
+An object that was moved since then keeps its last lit colours, over a contact shadow of its footprint.
 """
 
 import math
@@ -36,26 +36,26 @@ from splatgraft.segmentation import CUT_SIDE_PX, grabcut_mask, seed_selection
 
 Kind = Literal["lit", "pasted", "result", "place", "shadow", "photo"]
 TINT = (1.0, 0.45, 0.1)
-"""sRGB color of what is selected."""
-_LONGEST_PX = 1920  # of a photo on the canvas; on a larger canvas the browser enlarges it
-_DARKEST = 0.5  # share of the light that a contact shadow takes
-_SHADOW_WIDTH = 0.35  # of a contact shadow over the object's radius
-_NO_TURN = 1e-5  # largest entry of a rotation over the identity's that rounding makes
-_FOOT_SHARE, _FOOT_POINTS = 0.2, 200  # part of an object's height that counts as its foot; its points
+"""sRGB colour of the selection."""
+_LONGEST_PX = 1920  # longer side of a photo; the browser enlarges it on a larger canvas
+_DARKEST = 0.5  # largest share of the light that a contact shadow removes
+_SHADOW_WIDTH = 0.35  # width of a contact shadow over the object's radius
+_NO_TURN = 1e-5  # largest deviation of a rotation from the identity by rounding
+_FOOT_SHARE, _FOOT_POINTS = 0.2, 200  # part of an object's height that counts as its foot; number of its points
 
 
 @dataclass(frozen=True, eq=False)
 class _LitState:
-    """What is known of the lit scene of one state."""
+    """The lit scene of one state, in its current stage."""
 
     state: EditState
     stage: str
-    """"final", "refined" or "draft"; "file": read from the step's result, without layers."""
+    """Stage of the light: `final`, `refined` or `draft`; `file`: the step's result, without layers."""
     relit: Relit | None
     baked: tuple[Gaussians, Bool[Tensor, "b"]] | None = None
 
     def fits(self, state: EditState) -> bool:
-        """Whether a state has the same light at the same places."""
+        """Return whether a state has the same light and placements."""
         return self.state.light is state.light and self.stands_as(state)
 
     def stands_as(self, state: EditState) -> bool:
@@ -63,7 +63,7 @@ class _LitState:
 
 
 def same_places(a: Sequence[ObjectPlacement] | None, b: Sequence[ObjectPlacement] | None) -> bool:
-    """Whether the same objects stand at the same places."""
+    """Return whether objects and placements are the same."""
     if a is b:
         return True
     return len(a or ()) == len(b or ()) and all(
@@ -76,15 +76,15 @@ def same_places(a: Sequence[ObjectPlacement] | None, b: Sequence[ObjectPlacement
 
 
 class LitScenes:
-    """The newest lit scenes, from the light process and from the step's files."""
+    """The newest lit scene, from the light process or the step's files."""
 
     def __init__(self, scenes: SceneCache) -> None:
-        """Know of none yet."""
+        """Start without a lit scene."""
         self._scenes, self._memo, self._lock = scenes, Memo(), threading.RLock()
         self._now: _LitState | None = None
 
     def add(self, state: EditState, lit: Lit) -> None:
-        """Take layers that the light process has made."""
+        """Store layers of the light process unless better ones are known."""
         with self._lock:
             order = ("draft", "refined", "final")
             now = self._now
@@ -99,7 +99,7 @@ class LitScenes:
             self._now = _LitState(state, lit.stage, relit)
 
     def adopt(self, state: EditState) -> None:
-        """Take the result of the step `relight`, which is up to date for a state."""
+        """Read the result of the step `relight`, which is up to date for a state."""
         path = self._scenes.files.relit
         flags = read_flags(path.with_name(IS_OBJECT_FILE))
         scene = self._scenes.gaussians(path)
@@ -107,19 +107,19 @@ class LitScenes:
             self._now = _LitState(state, "file", None, (scene, flags))
 
     def stage(self, state: EditState) -> str:
-        """The stage of what is known of a state; empty where nothing is."""
+        """Return the stage of a state's light; empty if it is not known."""
         now = self._now
         if now is None or not now.fits(state):
             return ""
         return "draft" if now.stage == "file" and not _same_weights(now.state, state) else now.stage
 
     def relit(self, state: EditState) -> Relit | None:
-        """The layers of a state; None where they are not known yet."""
+        """Return the layers of a state; None if they are not known yet."""
         now = self._now
         return now.relit if now is not None and now.fits(state) else None
 
     def scene(self, state: EditState, *, is_dragged: bool = False) -> Gaussians:
-        """The scene of a state with the newest colours; in a drag the support is not flattened under the objects."""
+        """Return a state's scene with the newest colours; in a drag the support is not flattened under objects."""
         now = self._now
         if not self._scenes.files.transfers_light or not state.objects:
             return self.pasted(state)
@@ -128,12 +128,12 @@ class LitScenes:
         return self._moved(now, state, self.place(state) if is_dragged else self._flattened(state))
 
     def pasted(self, state: EditState) -> Gaussians:
-        """The scene that the step `compose` writes."""
+        """Return the scene that the step `compose` writes."""
         composite = self._scenes.composite(state)
         return self._memo.get("pasted", (composite,), composite.bake)[0]
 
     def place(self, state: EditState) -> Gaussians:
-        """The target without what is erased."""
+        """Return the target without erased Gaussians."""
         target, erased = self._scenes.gaussians(self._scenes.files.target_scene), state.erased
         if erased is None:
             return target
@@ -145,7 +145,7 @@ class LitScenes:
         return self._memo.get("place", (target, erased), lambda: target.select(~erased))
 
     def forget(self) -> None:
-        """Know of none again: files or options have changed."""
+        """Discard the lit scene, because files or options have changed."""
         with self._lock:
             self._now = None
 
@@ -157,13 +157,13 @@ class LitScenes:
         return self._memo.get("baked", (relit, weights), lambda: relit.bake(weights))
 
     def _flattened(self, state: EditState) -> Gaussians:
-        """The target, with the layers flattened that the objects stand on, which takes longer than a picture."""
+        """Return the target, flattened under the objects; this takes longer than a picture."""
         composite = self._scenes.composite(state)
         count = composite.kept_count
         return self._memo.get("flattened", (composite,), lambda: composite.merged()[0].map(lambda rows: rows[:count]))
 
     def _moved(self, lit: _LitState | None, state: EditState, place: Gaussians) -> Gaussians:
-        """The objects at other places of the target than where they were lit last."""
+        """Return the scene with the last lit objects moved to new placements."""
         objects = list(state.objects or ())
         parts = self._lit_objects(lit, state.weights) if lit is not None else {}
         moved, feet = [], []
@@ -179,11 +179,11 @@ class LitScenes:
             feet.append((move.points(self._foot(item)), move.scale * self._scenes.placeable_object(item).base.radius))
         scene = concatenate([place, *moved])
         for points, radius in feet:
-            _darken(scene.sh, place, points, radius)  # of the new scene alone
+            _darken(scene.sh, place, points, radius)  # in place, because the scene is new
         return scene
 
     def _lit_objects(self, lit: _LitState, weights: LayerWeights) -> dict[int, tuple[object, Similarity, Gaussians]]:
-        """The lit objects in the target's frame, with file and placement, by their number."""
+        """Return the lit objects in the target's frame, with file and placement, by number."""
 
         def make() -> dict[int, tuple[object, Similarity, Gaussians]]:
             scene, is_object = self._baked(lit, weights)
@@ -199,7 +199,7 @@ class LitScenes:
         return self._memo.get("lit objects", (lit, weights), make)
 
     def _foot(self, item: ObjectPlacement) -> Float[Tensor, "k 3"]:
-        """Points of an object's foot, its own frame."""
+        """Sample points of an object's foot, in its own frame."""
         one = self._scenes.placeable_object(item)
 
         def make() -> Float[Tensor, "k 3"]:
@@ -211,7 +211,7 @@ class LitScenes:
 
 
 def _moved_by(move: Similarity, gaussians: Gaussians) -> Gaussians:
-    """The Gaussians at another place; without a turn their colours need no rotation, which takes longest."""
+    """Move Gaussians; the slow rotation of colours is skipped if the move has no rotation."""
     if float((move.rotation - torch.eye(3)).abs().max()) > _NO_TURN:
         return move.gaussians(gaussians)
     log_scales = gaussians.log_scales + math.log(move.scale)
@@ -223,7 +223,7 @@ def _same_weights(a: EditState, b: EditState) -> bool:
 
 
 def _darken(sh: Float[Tensor, "n k 3"], place: Gaussians, foot: Float[Tensor, "m 3"], radius: float) -> None:
-    """Draw a contact shadow into the colours of a place, the first rows of `sh`; it fades away from the foot."""
+    """Darken the colours of a place, the first rows of `sh`, by a contact shadow that fades away from the foot."""
     width = _SHADOW_WIDTH * radius
     middle = foot.mean(0)
     reach = float((foot - middle).norm(dim=1).max()) + 2 * width
@@ -239,13 +239,13 @@ class Pictures:
     """Pictures of one project."""
 
     def __init__(self, scenes: SceneCache) -> None:
-        """Draw nothing yet."""
+        """Start without a lit scene."""
         self._scenes, self.lit, self._memo = scenes, LitScenes(scenes), Memo()
 
     def draw(
         self, kind: Kind, state: EditState, camera: Cameras, photo: int | None = None, *, is_dragged: bool = False
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """Draw the target; ValueError where what is needed does not exist yet."""
+        """Draw the target; raise ValueError if an input does not exist yet."""
         if kind == "photo":
             return self._target_photo(camera, photo)
         if kind == "shadow":
@@ -280,7 +280,7 @@ class Pictures:
     # the source
 
     def source_photo(self, index: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
-        """A photo of the source, upright and at most 1920 pixels long, and its own width and height."""
+        """Read a photo of the source, upright and at most 1920 pixels long, and its own width and height."""
         path = self._scenes.photo(self._scenes.files.source_cameras, index)
         stamp = path.stat().st_mtime_ns if path.is_file() else 0
         return self._scenes.derive("photo", (str(path), stamp), lambda: read_upright(path, _LONGEST_PX))
@@ -288,7 +288,7 @@ class Pictures:
     def draw_source(
         self, which: Bool[Tensor, "n"] | None, camera: Cameras, *, photo: int | None, alone: bool
     ) -> UInt8[np.ndarray, "h w 3"]:
-        """Draw the source with the selected Gaussians tinted, or them alone; a photo stands in place of the scene."""
+        """Draw the source with the selection tinted, or the selection alone; `photo` replaces the rendered scene."""
         scene = self._scenes.gaussians(self._scenes.files.source_scene)
         if alone and which is not None:
             return draw(scene.select(which), camera)
@@ -311,9 +311,9 @@ class Pictures:
         return _tinted(out, whole)
 
     def outline(self, state: EditState, photo: int) -> list[list[tuple[float, float]]]:
-        """The outline by the clicks in one photo, as the first round of `segment` finds it, over the photo's sides.
+        """Outline the object in one photo by the clicks, as the first round of `segment` does, over the photo's sides.
 
-        ValueError where no object is found.
+        Raise ValueError if no object is found.
         """
         cameras = self._scenes.cameras(self._scenes.files.source_cameras)
         scene = self._scenes.gaussians(self._scenes.files.source_scene)
@@ -324,7 +324,7 @@ class Pictures:
             if len(given.inside) or len(given.outside) or given.box is not None:
                 size, here = self.source_photo(index)[1], small.sizes[index].tolist()
                 prompts[index] = given.scaled(here[0] / size[0], here[1] / size[1])
-        # not in the scenes' memo, for which pictures would wait
+        # not in the scenes' memo, because pictures would wait for its lock
         selected, _ = self._memo.get(
             "seed", (scene, state.prompts), lambda: seed_selection(scene, small, prompts=prompts)
         )
@@ -338,18 +338,18 @@ class Pictures:
 
 
 def draw(scene: Gaussians, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
-    """A scene in a view."""
+    """Render a scene in a view."""
     with torch.inference_mode():
         return to_bytes(render(scene, camera).color[0])
 
 
 def to_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture in [0, 1] in bytes."""
+    """Convert a picture in [0, 1] to bytes."""
     return (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
 def _tinted(pixels: UInt8[np.ndarray, "h w 3"], share: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture with a colour over what is selected, and a line around it."""
+    """Tint the selection in a picture, and draw its outline."""
     inside = share.clip(0, 1)[..., None]
     out = pixels * (1 - 0.4 * inside) + 0.4 * inside * 255 * np.array(TINT)
     out = np.ascontiguousarray(out.clip(0, 255).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""The step `Place`: objects are placed by the pointer, numbers and operations; parts of the target are erased."""
+"""The step `Place`: place objects by the pointer, numbers and operations; erase parts of the target."""
 
 import math
 from collections.abc import Callable
@@ -43,17 +43,17 @@ if TYPE_CHECKING:
 
 _NUDGE = 0.05  # step of an arrow key over the object's height
 _SNAP_DEGREES = 15.0
-_SAME = 0.002  # relative difference below which two sizes count as one
-_MIN_OPACITY = 0.3  # from which a Gaussian counts for the outline of its object
+_SAME = 0.002  # relative difference below which two sizes count as equal
+_MIN_OPACITY = 0.3  # lowest opacity of Gaussians that count for the outline of their object
 _MODES = {"move": "W", "turn": "R", "size": "S", "lift": "E"}
 _RED = "#f04646"
 
 
 class PlacePanel(Panel):
-    """Its controls, and the target with its objects in the view."""
+    """Controls of the objects, and the target with its objects in the view."""
 
     def __init__(self, editor: "Editor") -> None:
-        """Hold nothing yet."""
+        """Start without a drag or box."""
         super().__init__(editor)
         self._chosen, self._snaps, self._path, self._known_cm = 0, False, "", 0.0
         self._drag: tuple[int, DragMode, tuple[float, float], Drag] | None = None
@@ -61,22 +61,22 @@ class PlacePanel(Panel):
         self._held_box: BoxDrag | None = None
 
     def enter(self) -> None:
-        """Show the light, which follows the edits."""
+        """Show the new light instead of the result."""
         if self.editor.kind == "Result":
             self.editor.kind = "With its new light"
 
     def leave(self) -> None:
-        """Put everything down."""
+        """End drags and remove the box."""
         self._drag = self._box = self._held_box = None
 
     def tools(self) -> dict[str, Any]:
-        """How an object is dragged."""
+        """Return the drag modes of an object."""
         session = self.editor.session
         is_any = session is not None and bool(session.objects())
         return {"tools": [[mode, mode.capitalize(), key] for mode, key in _MODES.items()]} if is_any else {}
 
     def build(self, form: Form) -> None:
-        """Describe the controls."""
+        """Add the controls."""
         session = self.editor.require_session()
         if not session.files.target_scene.is_file():
             form.note("The place is not there yet: see Open.")
@@ -275,7 +275,7 @@ class PlacePanel(Panel):
     # keys
 
     def key(self, view: View, key: str) -> bool:
-        """Take the keys of this step."""
+        """Handle the keys of this step."""
         arrows = {"arrowleft": (-1, 0), "arrowright": (1, 0), "arrowup": (0, 1), "arrowdown": (0, -1)}
         work: dict[str, Callable[[], object]] = {
             "g": lambda: self._operate("Drop"),
@@ -291,7 +291,7 @@ class PlacePanel(Panel):
         return key in arrows or key in work
 
     def _nudge(self, view: View, right: int, away: int) -> None:
-        """Move the chosen object by a small step: to the right in the view, and away from the viewer."""
+        """Move the chosen object by small steps to the right in the view and away from the viewer."""
         session, orbit = self.editor.require_session(), self.editor.orbit(view)
         if orbit is None or not session.objects():
             return
@@ -303,7 +303,7 @@ class PlacePanel(Panel):
     # the pointer
 
     def overlay(self, view: View, camera: Cameras) -> dict[str, Any]:
-        """Outlines of the objects, by which they are held, and the box to erase in."""
+        """Describe the outlines by which objects are dragged, and the box to erase in."""
         session = self.editor.require_session()
         items = self.editor.shown_state().objects or ()
         hulls = []
@@ -365,7 +365,7 @@ class PlacePanel(Panel):
         check_state(edited)
         if pointer.what == "up":
             self._drag = None
-            # the very state that was shown, so that its light holds
+            # the shown state itself, so that its light stays valid
             shown = self.editor.live
             session.change(shown if shown is not None and same_places(shown.objects, edited.objects) else edited)
             self.editor.show_live(None)
@@ -399,7 +399,7 @@ class PlacePanel(Panel):
 
 
 def _about(size: ObjectSize, *, is_given: bool) -> str:
-    """What is known of an object's size, and how to tell the rest; `is_given`: project.toml says the scale."""
+    """Describe an object's known size and how to enter the rest; `is_given`: project.toml sets the scale."""
     if size.place is None and is_given:
         return (
             "Same size as in its photos."

@@ -1,4 +1,4 @@
-"""An object's placement: its handles and its size, and operations such as drop, upright, rescale and duplicate."""
+"""An object's placement: its gizmo and size, and operations such as drop, upright, rescale and duplicate."""
 
 import math
 import warnings
@@ -22,15 +22,15 @@ from splatgraft.project.metric_scale import MetricScale
 Triple = tuple[float, float, float]
 
 _BESIDE = 2.2
-"""Distance of a duplicate over the object's reach to the sides: a fifth of it remains between them."""
+"""Distance of a duplicate over the object's reach; the gap is a fifth of the reach."""
 _INSIDE = 0.98
-"""Share of an object's Gaussians within its reach, so that floaters do not count."""
+"""Share of an object's Gaussians within its reach; floaters do not count."""
 _DIRECTIONS = 8
-"""Directions in which a place for a duplicate is looked for."""
+"""Number of directions in which a place for a duplicate is searched."""
 _MIN_FLAT = 0.6
-"""Share of the object's base that stands on the surface."""
+"""Smallest share of the object's base on the surface."""
 _SAME_HEIGHT = 0.15
-"""Largest difference of heights over the object's own, at which two places count as one surface."""
+"""Largest height difference of places on one surface, over the object's height."""
 
 
 @dataclass(frozen=True)
@@ -46,58 +46,58 @@ class Gizmo:
 
 
 def gizmo_from_similarity(target_from_object: Similarity, pivot: Float[Tensor, "3"]) -> Gizmo:
-    """The gizmo of an object placed by `target_from_object`, at `pivot` of the object's own frame."""
+    """Return the gizmo of an object placed by `target_from_object`, at `pivot` in the object's frame."""
     w, i, j, k = quaternion_from_rotation(target_from_object.rotation[None])[0].tolist()
     x, y, z = target_from_object.points(pivot).tolist()
     return Gizmo((x, y, z), (w, i, j, k), target_from_object.scale)
 
 
 def similarity_from_gizmo(gizmo: Gizmo, pivot: Float[Tensor, "3"]) -> Similarity:
-    """The placement that puts `pivot` where the gizmo is."""
+    """Return the placement that puts `pivot` at the gizmo."""
     rotation = rotation_from_quaternion(torch.tensor([gizmo.wxyz], dtype=torch.float64))[0]
     translation = torch.tensor(gizmo.position, dtype=torch.float64) - gizmo.scale * rotation @ pivot.double()
     return Similarity(scale=gizmo.scale, rotation=rotation.float(), translation=translation.float())
 
 
 def degrees_from_quaternion(wxyz: tuple[float, float, float, float]) -> Triple:
-    """Rotation angles about the fixed x, then y, then z axis, in degrees."""
+    """Return rotation angles about the fixed x, then y, then z axis, in degrees."""
     w, i, j, k = wxyz
-    with warnings.catch_warnings(action="ignore"):  # gimbal lock: one of many triples is as good as another
+    with warnings.catch_warnings(action="ignore"):  # gimbal lock: any of the valid triples will do
         x, y, z = Rotation.from_quat([i, j, k, w]).as_euler("xyz", degrees=True).tolist()
     return x, y, z
 
 
 def quaternion_from_degrees(degrees: Triple) -> tuple[float, float, float, float]:
-    """The quaternion wxyz of rotations about the fixed x, then y, then z axis, in degrees."""
+    """Return the quaternion wxyz of rotations about the fixed x, then y, then z axis, in degrees."""
     i, j, k, w = Rotation.from_euler("xyz", degrees, degrees=True).as_quat().tolist()
     return w, i, j, k
 
 
 @dataclass(frozen=True)
 class ObjectSize:
-    """The size of one placed object, and what is known of the captures' units."""
+    """The size of one placed object, and the captures' scales if they are known."""
 
     height: float
-    """From its base to its top, units of its own capture."""
+    """Height from base to top, units of its own capture."""
     scale: float
     """Size in the target over size in its own capture."""
     own: MetricScale | None
-    """Scale of the object's own capture; None where it is not known, or the object was added from a file."""
+    """Scale of the object's own capture; None if it is unknown or the object was added from a file."""
     place: MetricScale | None
-    """Scale of the target's capture; None where it is not known."""
+    """Scale of the target's capture; None if it is unknown."""
 
     @property
     def here_cm(self) -> float | None:
-        """Height in the target; None where its scale is not known."""
+        """Height in the target, cm; None if its scale is unknown."""
         return None if self.place is None else 100 * self.place.metres_per_unit * self.scale * self.height
 
     @property
     def true_cm(self) -> float | None:
-        """Height in its own capture; None where that one's scale is not known."""
+        """Height in its own capture, cm; None if that scale is unknown."""
         return None if self.own is None else 100 * self.own.metres_per_unit * self.height
 
     def scale_at(self, here_cm: float) -> float:
-        """The `scale` at which the object is that tall in the target; ValueError where the target's is not known."""
+        """Return the `scale` for a height in the target; raise ValueError if the target's scale is unknown."""
         check_height_cm(here_cm)
         if self.place is None:
             raise ValueError("target: expected a capture whose scale is known, found none; see `splatgraft scale`")
@@ -106,24 +106,24 @@ class ObjectSize:
 
 @dataclass(frozen=True)
 class PlaceableObject:
-    """An object with its base and the capture that it comes from."""
+    """An object with its base and its capture."""
 
     gaussians: Gaussians
-    """In the frame of its own capture."""
+    """Gaussians in the frame of the object's capture."""
     base: ObjectBase
-    """Its base: lowest point, up and size, in the same frame."""
+    """Lowest point, up and size, in the same frame."""
     cameras: Cameras
-    """Cameras of its capture; those of the target where the object was added from a file."""
+    """Cameras of the capture; those of the target if the object was added from a file."""
     surroundings: Gaussians | None
-    """Its capture without the object; None where not known."""
+    """The capture without the object; None if unknown."""
 
 
 def suggest_placement(
     target: Gaussians, item: PlaceableObject, cameras: Cameras, options: PlaceOptions = PlaceOptions()
 ) -> Placed:
-    """Suggest a place as `compose` does, and half of the guessed size where no place is free: it can be dragged.
+    """Suggest a placement as `compose` does; if no place is free, place the object at half of the guessed size.
 
-    ValueError where there is no surface.
+    Raise ValueError if there is no surface.
     """
     both = (cameras, item.cameras)
     place = partial(place_object, target, item.gaussians, cameras=both, surroundings=item.surroundings)
@@ -136,9 +136,9 @@ def suggest_placement(
 def drop_to_surface(
     target: Gaussians, item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]
 ) -> Similarity:
-    """Move vertically onto the surface and align with it; scale and rotation about the vertical stay.
+    """Move vertically onto the surface and align with its normal; keep scale and yaw.
 
-    ValueError where nothing lies below.
+    Raise ValueError if there is no surface below.
     """
     base_point = target_from_object.points(item.base.point)
     # start at half the object's height: a sunk object is lifted, and surfaces above the object are ignored
@@ -164,7 +164,7 @@ def rescale(item: PlaceableObject, target_from_object: Similarity, scale: float)
 def plausible_scale(
     target: Gaussians, item: PlaceableObject, target_from_object: Similarity, cameras: Cameras
 ) -> float:
-    """The scale at which the object fills the default share of the views at its place."""
+    """Return the scale at which the object fills the default share of the views."""
     x, y, z = (
         target_from_object.points(item.base.point)
         + 0.25 * target_from_object.scale * item.base.height * estimate_up(cameras)
@@ -176,9 +176,9 @@ def plausible_scale(
 def place_beside(
     target: Gaussians, item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]
 ) -> tuple[Similarity, bool]:
-    """The same object on the surface of the target and its objects beside itself, at the same height.
+    """Place a duplicate beside the object, on a surface of `target` at the same height.
 
-    And whether there is a surface at that height; else the object stands beside itself in the air.
+    Also return whether there is such a surface; if not, the duplicate is in the air beside the object.
     """
     up = torch.nn.functional.normalize(up, dim=0)
     axis = torch.eye(3)[int(up.abs().argmin())]
@@ -196,22 +196,22 @@ def place_beside(
         try:
             support = rest_on_surface(target, item.base, point=above, up=up, scale=scale)[1]
         except ValueError:
-            continue  # nothing lies below there
+            continue  # no surface below
         drop = float(support.point @ up) - old
         if abs(drop) <= _SAME_HEIGHT * size and support.flat_fraction >= _MIN_FLAT:
-            # it keeps its rotation: only the height is that of the surface
+            # keep the rotation; adapt only the height
             return _shifted(shifted, drop * up), True
     return _shifted(target_from_object, step * across), False
 
 
 def snapped_angles(degrees: tuple[float, float, float], step: float) -> tuple[float, float, float]:
-    """Angles rounded to multiples of `step` degrees."""
+    """Round angles to multiples of `step` degrees."""
     x, y, z = (round(angle / step) * step for angle in degrees)
     return x, y, z
 
 
 def _reach(item: PlaceableObject) -> float:
-    """How far an object reaches to the sides of its foot, in its own units."""
+    """Return an object's horizontal extent from its foot, in its own units."""
     offset = item.gaussians.means - item.base.point
     sideways = (offset - (offset @ item.base.up)[:, None] * item.base.up).norm(dim=1)
     return max(item.base.radius, float(sideways.quantile(_INSIDE)))
@@ -229,6 +229,6 @@ def _about_base_point(
 
 
 def _twist_about(rotation: Float[Tensor, "3 3"], axis: Float[Tensor, "3"]) -> float:
-    """The twist angle of `rotation` about unit `axis` (swing-twist decomposition), radians."""
+    """Compute the twist angle of `rotation` about unit `axis` (swing-twist decomposition), radians."""
     i, j, k, w = Rotation.from_matrix(rotation.double().numpy()).as_quat()
     return 2 * math.atan2(float(torch.tensor([i, j, k]) @ axis.double()), w)

@@ -1,4 +1,4 @@
-"""The project that is edited: its files by project.toml, which steps are stale, and the commands that run them."""
+"""The edited project: its files by project.toml, the stale steps, and the commands that run them."""
 
 import sys
 from collections.abc import Mapping
@@ -31,19 +31,19 @@ from splatgraft.steps.segment import Segment
 from splatgraft.workflow.flow import Flow, read_flow, reasons
 
 ExportPage = Literal["viewer", "report"]
-"""What an exported .html holds."""
+"""Contents of an exported .html."""
 PROBLEM = "project"
-"""Entry of `Project.reasons` where project.toml is invalid."""
+"""Entry of `Project.reasons` if project.toml is invalid."""
 
 
 @dataclass(frozen=True)
 class RenderedViews:
-    """How images of a scene without photographs are rendered."""
+    """Options for rendering images of a scene without photographs."""
 
     up: Triple | None = None
     """Up direction in the scene's frame; None: estimated."""
     is_within: bool = False
-    """Whether the cameras look outwards from the middle of the scene, else at it from around."""
+    """Whether the cameras look outwards from the middle of the scene, or inwards from around it."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ class ProjectFiles:
     file: Path
     """project.toml; placement.json, light.json, erased.npy and corrections.npy lie beside it."""
     root: Path
-    """All results; uploads and exports too."""
+    """Folder of all results and exports."""
     source_scene: Path
     """The reconstruction with the object."""
     target_scene: Path
-    """The reconstruction that receives it."""
+    """The reconstruction into which it is placed."""
     source_cameras: Path
     """transforms.json of the posed source."""
     target_cameras: Path
@@ -67,7 +67,7 @@ class ProjectFiles:
     surroundings: Path
     """The source without the object."""
     selection: Path
-    """Which Gaussians of the source are the object."""
+    """Flags of the source's Gaussians that are the object."""
     placement: Path
     """The composite's placement.json, which names its objects."""
     relit: Path
@@ -79,9 +79,9 @@ class ProjectFiles:
     without_photos: tuple[bool, bool]
     """Whether source and target are scenes without photographs, whose images are rendered from the scene."""
     rendered_views: tuple[RenderedViews, RenderedViews]
-    """How the images of source and target are rendered, where they are scenes without photographs."""
+    """Options for rendering the images of source and target, used for scenes without photographs."""
     light_mode: Literal["transfer", "off"]
-    """`light` of [relight]: the physical transfer, or nothing."""
+    """`light` of [relight]: the physical transfer, or none."""
     relight_options: RelightOptions
     """`options` of [relight]."""
     place_options: PlaceOptions
@@ -103,7 +103,7 @@ class Project:
     """Folder of all results; None: the folder of project.toml."""
 
     def files(self) -> ProjectFiles | None:
-        """The project's files; None where project.toml does not exist yet."""
+        """Read the project's files; None if project.toml does not exist yet."""
         if not self.file.is_file():
             return None
         flow = read_flow(self.file, self.out)
@@ -134,14 +134,14 @@ class Project:
         )
 
     def reasons(self) -> Mapping[str, str | None]:
-        """For each step why it is stale, as in `status`; one entry with the error where project.toml is invalid."""
+        """Return why each step is stale, as in `status`, or one entry with the error if project.toml is invalid."""
         try:
             return reasons(read_flow(self.file, self.out))
         except ValueError as error:
             return {PROBLEM: str(error)}
 
     def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:
-        """Write project.toml of two captures or scene files, and of scenes trained on them where there are any."""
+        """Write project.toml for two captures or scene files, and for scenes trained on them if given."""
         for scene in scenes:
             if scene is not None and not scene.is_file():
                 raise ValueError(f"{scene}: expected a trained scene, found no such file")
@@ -160,17 +160,17 @@ class Project:
             stream.write(text.encode())
 
     def run_words(self, to: str) -> tuple[str, ...]:
-        """The command that runs the stale steps up to `to`, after `splatgraft`."""
+        """Return the arguments of `splatgraft` that run the stale steps up to `to`."""
         out = () if self.out is None else ("--out", str(self.out))
         return ("run", str(self.file), "--to", to, *out)
 
     def export_words(self, to: Path, *, page: ExportPage, layer: Layer) -> tuple[str, ...]:
-        """The command that writes the result, or a part of it, as a file whose suffix names the format."""
+        """Return the arguments of `splatgraft` that write the result or a part of it in the suffix's format."""
         part = ("--page", page) if page == "report" else () if layer == "all" else ("--layer", layer)
         return ("export", str(self._root()), "--to", str(to), *part)
 
     def job_command(self, words: tuple[str, ...], title: str) -> tuple[str, ...]:
-        """The command line of the child process that runs one of these commands as a job."""
+        """Return the command line of the child process that runs these arguments as a job."""
         return (sys.executable, "-m", "splatgraft.editor.job_process", str(self._root() / EDITOR_FOLDER), title, *words)
 
     def _root(self) -> Path:
@@ -200,8 +200,8 @@ _EDITS = {
 
 
 def in_words(step: str, reason: str) -> str:
-    """Why a step is stale, as its user would say it; other reasons as they are."""
-    # `compose` finds a place from the cameras until there is one by hand
+    """Rephrase why a step is stale in the user's words; keep other reasons."""
+    # `compose` finds a place from the cameras until one is set by hand
     if step == "compose" and reason.partition(":")[0] in ("cameras", "placement"):
         return _EDITS["placement.json"]
     if step == "relight" and reason.partition(" is now ")[0] in _WEIGHTS:

@@ -1,6 +1,6 @@
 """The edited scene with transferred light for pictures: the result of the step `relight`, and faster drafts of it.
 
-A draft relights a reduced level of detail and copies the layers to the nearest Gaussians at full detail.
+A draft relights a subset of the Gaussians; the others get the layers of the nearest one.
 """
 
 import threading
@@ -32,13 +32,13 @@ class CoarseGaussians:
     """A subset of a scene's Gaussians, with the nearest member of the subset for each Gaussian of the scene."""
 
     gaussians: Gaussians
-    """The m Gaussians that cover most."""
+    """The m Gaussians with the largest coverage."""
     nearest: Int[Tensor, "n"]
-    """For each of the scene's n Gaussians the index of the nearest of `gaussians`."""
+    """Index into `gaussians` of the nearest one, for each of the scene's n Gaussians."""
 
 
 def coarsen(gaussians: Gaussians, budget: int) -> CoarseGaussians:
-    """Reduce a scene to at most `budget` Gaussians; the same object where it has no more."""
+    """Reduce a scene to at most `budget` Gaussians; keep the same object if it has no more."""
     if gaussians.count <= budget:
         return CoarseGaussians(gaussians, torch.arange(gaussians.count))
     subset = gaussians.select(largest_coverage_indices(gaussians, budget))
@@ -49,7 +49,7 @@ def coarsen(gaussians: Gaussians, budget: int) -> CoarseGaussians:
 def upsample_light(relit: Relit, composite: Composite, parts: Sequence[CoarseGaussians]) -> Relit:
     """Copy the layers of a relit coarse composite to all Gaussians of `composite`, from the nearest coarse Gaussian.
 
-    `parts` are the coarse target without what is erased, and the coarse objects; none of their Gaussians is split.
+    `parts` are the coarse target without erased Gaussians, and the coarse objects; no Gaussian is split.
     """
     counts = [part.gaussians.count for part in parts]
     assert relit.gaussians.count == sum(counts)
@@ -75,7 +75,7 @@ def upsample_light(relit: Relit, composite: Composite, parts: Sequence[CoarseGau
 
 
 def largest_coverage_indices(gaussians: Gaussians, budget: int) -> Int[Tensor, "m"]:
-    """Indices of the at most `budget` Gaussians with the largest opacity times disc area, in ascending order."""
+    """Return the ascending indices of at most `budget` Gaussians with the largest opacity times disc area."""
     if gaussians.count <= budget:
         return torch.arange(gaussians.count)
     two_largest = gaussians.log_scales.sort(dim=1).values[:, 1:].sum(1)
@@ -94,30 +94,30 @@ class RelitPreview:
         self._full_lock, self._draft_lock = threading.RLock(), threading.RLock()
 
     def is_relit(self, state: EditState) -> bool:
-        """Whether the light of this state is memoised, or project.toml selects no physical light transfer."""
+        """Return whether this state's light is memoised, or project.toml selects no physical light transfer."""
         return not self._scenes.files.transfers_light or self._memo.peek("relit", self._inputs(state)) is not None
 
     def best(self, state: EditState) -> Relit | None:
-        """The best of what is memoised of this state: the light, else a refined draft, else a draft; else None."""
+        """Return the best memoised result of this state: the light, a refined draft, a draft, or None."""
         inputs = self._inputs(state)
         found = (self._memo.peek(name, inputs) for name in ("relit", "refined", "draft"))
         return next((relit for relit in found if relit is not None), None)
 
     def relit(self, state: EditState) -> Relit:
-        """The layers of the full light transfer of this state, as the step computes them."""
+        """Compute the layers of this state's full light transfer, as the step does."""
 
         def make() -> Relit:
-            # the step knows of no place before: sources and shadow maps are those of this one
+            # as in the step, sources and shadow maps are those of this placement
             relit = self._transfer(state, exact=True)
-            self._memo.forget("refined")  # a second copy of a large scene
+            self._memo.forget("refined")  # it would be a second copy of a large scene
             return relit
 
         return self._make_once("relit", state, make, lock=self._full_lock)
 
     def refine(self, state: EditState) -> bool:
-        """After a move, make all layers at full detail under the sources of the light that were estimated before it.
+        """Compute all layers at full detail after a move, with the light sources estimated before it.
 
-        Takes less time than `relit`. False where nothing was moved, or these layers are there already.
+        This takes less time than `relit`. Return False if nothing was moved or these layers exist already.
         """
         options, composite = self._scenes.files.relight_options, self._scenes.composite(state)
         is_moved = self._full_values.is_moved(composite, self._cameras(), state.light, options)
@@ -127,13 +127,13 @@ class RelitPreview:
         return True
 
     def draft(self, state: EditState) -> Relit:
-        """A draft of the light transfer: shadow edges are coarse, and the first draft leaves out the source's light."""
-        # a draft must not wait for the light itself; of a small scene, both share the values of the transfer
+        """Compute a draft with coarse shadow edges; the first draft omits the light of the source scene."""
+        # a draft must not wait for the final light; for a small scene both share the transfer's values
         lock = self._draft_lock if _is_large(self._scenes.composite(state)) else self._full_lock
         return self._make_once("draft", state, lambda: self._draft(state), lock=lock)
 
     def prepare_drafts(self, state: EditState) -> None:
-        """Compute once what later drafts share, with the light of the source scene, which the first draft omits."""
+        """Compute the shared values of later drafts once, with the light of the source scene."""
         composite, sources = self._scenes.composite(state), self._scenes.source_scenes(state)
         if self._scenes.files.transfers_light and (_is_large(composite) or not self._memo.has("relit")):
             with self._draft_lock if _is_large(composite) else self._full_lock:
@@ -141,7 +141,7 @@ class RelitPreview:
                 self._memo.get("drafts prepared", shared, lambda: self._draft(state, with_sources=True))
 
     def layers(self, state: EditState, *, draft: bool) -> Relit:
-        """The layers of the light transfer, or the best draft of them."""
+        """Return the layers of the light transfer, or their best draft."""
         return (self.best(state) or self.draft(state)) if draft else self.relit(state)
 
     def _make_once(
@@ -178,7 +178,7 @@ class RelitPreview:
         if _is_large(composite):
             kept = (composite.target, composite.erased)
             target = memo.get("coarse target", kept, lambda: coarsen(kept[0].select(~kept[1]), TARGET_BUDGET))
-            # duplicates of an object share its coarse Gaussians, and so the light at its old place
+            # duplicates of an object share its coarse Gaussians, and thereby the light at its old place
             given = [one.gaussians for one in composite.objects]
             first = [next(i for i, other in enumerate(given) if other is one) for one in given]
             objects = [

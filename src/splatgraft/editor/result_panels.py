@@ -1,4 +1,4 @@
-"""The steps `Run` and `Share`: make the result of the edits, and write it or a part of it in any format of `export`."""
+"""The steps `Run` and `Share`: compute the result of the edits, and export it or a part of it."""
 
 import shlex
 from dataclasses import replace
@@ -25,27 +25,27 @@ if TYPE_CHECKING:
     from splatgraft.editor.editor import Editor
 
 _LABEL = "Update result"
-_LISTED = 6  # shared files that are listed, the newest ones
+_LISTED = 6  # number of listed shared files, newest first
 _SHOWN_SUFFIXES = (".html", ".png", ".jpg", ".webp", ".gif", ".mp4")
 _PICTURE, _SAVED_WIDTH = "view.png", 1280
 
 
 class RunPanel(Panel):
-    """Makes the result of the edits, or makes it again."""
+    """Controls to compute the result of the edits."""
 
     def __init__(self, editor: "Editor") -> None:
-        """Make no report unless it is wanted."""
+        """Start without the report."""
         super().__init__(editor)
         self._with_report = False
 
     def enter(self) -> None:
-        """Compare with the result, if there is one."""
+        """Show the result, if it exists."""
         session = self.editor.session
         if session is not None and session.files.result.is_file():
             self.editor.before, self.editor.kind = "Pasted, unlit", "Result"
 
     def build(self, form: Form) -> None:
-        """Say whether the result is that of the edits."""
+        """Say whether the result is up to date, and add the controls."""
         session = self.editor.require_session()
         form.note(self._said(session), name="result")
         form.button("run", _LABEL, lambda: self.editor.run(self._last_step(), _LABEL), main=True)
@@ -80,17 +80,17 @@ class RunPanel(Panel):
 
 
 class SharePanel(Panel):
-    """A job writes the file, which is then sent to the window that edits."""
+    """Controls to write a file by a job and send it to the editing window."""
 
     def __init__(self, editor: "Editor") -> None:
-        """Write a page to look at unless another kind is chosen."""
+        """Start with the first kind of file and the first part."""
         super().__init__(editor)
         self._kind, self._part = next(iter(sharing.SHARE_KINDS)), next(iter(sharing.PARTS))
         self._asked = 0
-        """The process of the job that writes a file for the window."""
+        """Process id of the job that writes a file for the window."""
 
     def build(self, form: Form) -> None:
-        """What can be written, the command, and the list of files."""
+        """Add the kinds of files, the command, and the list of files."""
         session = self.editor.require_session()
         kind = sharing.SHARE_KINDS[self._kind]
         why_not = sharing.why_not(session.files, kind)
@@ -116,7 +116,7 @@ class SharePanel(Panel):
         form.note(_command_line(session.project.export_words(to, page=page, layer=layer)), name="command", faint=True)
 
     def _wanted(self) -> tuple[Path, ExportPage, Layer]:
-        """The file to write, and what it holds."""
+        """Return the file to write, its page and its layer."""
         kind = sharing.SHARE_KINDS[self._kind]
         layer = sharing.PARTS[self._part] if kind.page == "viewer" else "all"
         return sharing.export_path(self.editor.require_session().files, kind, layer), kind.page, layer
@@ -131,7 +131,7 @@ class SharePanel(Panel):
         self.editor.say(f"{to.name}: being written; you can go on meanwhile")
 
     def job_ended(self, job: JobState) -> None:
-        """Send the file that a job has written, and say what the job said."""
+        """Send the file that a job has written, and show the job's messages."""
         if job.command[:1] != ("export",):
             return
         asked, self._asked = self._asked, 0
@@ -164,7 +164,7 @@ class SharePanel(Panel):
         editor.say(f"written: {path}")
 
     def _links(self, session: Session) -> list[tuple[str, str, str | None, str]]:
-        """The shared files with their sizes, to be opened or downloaded again."""
+        """List the shared files with their sizes, to open or download again."""
         files, rows = session.files, []
         newest = max((p.stat().st_mtime_ns for p in (files.result, files.relit) if p.is_file()), default=0)
         if sharing.has_report(files):
@@ -182,5 +182,5 @@ def _address(path: Path) -> str:
 
 
 def _command_line(words: tuple[str, ...]) -> str:
-    """A command that does the same."""
+    """Format the equivalent command."""
     return f"The same on the command line: {shlex.join(('splatgraft', *words))}"

@@ -40,28 +40,28 @@ class SceneCache:
         self._file_locks: dict[tuple[str, Path], threading.RLock] = {}
 
     def gaussians(self, path: Path) -> Gaussians:
-        """The scene in a file."""
+        """Read the scene in a file."""
         return self._read("gaussians", path, read_gaussians)
 
     def cameras(self, path: Path) -> Cameras:
-        """The cameras in a file."""
+        """Read the cameras in a file."""
         return self._read("cameras", path, read_cameras)
 
     def capture(self, path: Path) -> PosedImages:
-        """The posed images whose cameras are in a file."""
+        """Read the posed images whose cameras are in a file."""
         return self._read("capture", path, lambda path: read_capture(path.parent))
 
     def photo(self, path: Path, index: int) -> Path:
-        """The photo of a camera; the capture, which names it too, cannot be read where too many masks are missing."""
+        """Return the path of a camera's photo, even if `capture` fails because too many masks are missing."""
         return self._read("photos", path, lambda path: _named(path, "file_path"))[index] or path
 
     def missing_masks(self, path: Path) -> list[Path]:
-        """The masks that a transforms.json names, and that do not exist."""
+        """List the masks that a transforms.json names but that do not exist."""
         masks = self._read("masks", path, lambda path: _named(path, "mask_path"))
         return [mask for mask in masks if mask is not None and not mask.is_file()]
 
     def segmented(self) -> Bool[Tensor, "n"] | None:
-        """Flags of the source's Gaussians in the last result of `segment`; None where there is none."""
+        """Return the flags of the source's Gaussians by the last `segment`; None without a valid result."""
         if not self.files.selection.is_file() or not self.files.source_scene.is_file():
             return None
         found = self._read("selection", self.files.selection, read_flags)
@@ -69,11 +69,11 @@ class SceneCache:
         return found if len(found) == self.gaussians(self.files.source_scene).count else None
 
     def object_path(self, item: ObjectPlacement) -> Path:
-        """The file of a placed object."""
+        """Return the file of a placed object."""
         return item.object_path or self.files.object
 
     def placeable_object(self, item: ObjectPlacement) -> PlaceableObject:
-        """A placed object with its base."""
+        """Return a placed object with its base."""
         path = self.object_path(item)
         gaussians, own = self.gaussians(path), path == self.files.object
         cameras = self.cameras(self.files.source_cameras if own else self.files.target_cameras)
@@ -86,7 +86,7 @@ class SceneCache:
         return self.derive(f"placeable_object {path}", (gaussians, cameras, surroundings), make)
 
     def composite(self, state: EditState) -> Composite:
-        """The target with the placed objects; the same object for the same edits."""
+        """Compose the target with the placed objects; the same edits give the same object."""
         target = self.gaussians(self.files.target_scene)
 
         def make() -> Composite:
@@ -100,7 +100,7 @@ class SceneCache:
         return self.derive("composite", (target, state.objects, state.erased), make)
 
     def source_scenes(self, state: EditState) -> list[SourceScene | None]:
-        """The source scene of each placed object, as in the step `relight`; None for objects from other files."""
+        """List the source scene of each placed object, as in the step `relight`; None for other files' objects."""
         own = [self.object_path(item) == self.files.object for item in state.objects or ()]
         if not any(own) or not self.files.surroundings.is_file():
             return [None] * len(own)
@@ -110,19 +110,19 @@ class SceneCache:
         return [source if flag else None for flag in own]
 
     def target_clock(self) -> ClockSun | None:
-        """The sun by the clock of the target's photos."""
+        """Read the sun by the clock of the target's photos."""
         return self._clock(self.files.target_cameras)
 
     def _clock(self, cameras: Path) -> ClockSun | None:
         return self._read("clock", clock_sun_path(cameras), read_clock_sun)
 
     def derive(self, name: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
-        """The memoised result of `make`, computed again when one of `inputs` is another object."""
+        """Return the memoised result of `make`, computed again when one of `inputs` is another object."""
         with self._lock:
             return self._derived.get(name, inputs, make)
 
     def _read(self, kind: str, path: Path, read: Callable[[Path], Any]) -> Any:
-        # one lock per file: while a large scene is read, others are still to be had
+        # one lock per file, so that other files can be read while a large scene loads
         with self._file_locks.setdefault((kind, path), threading.RLock()):
             stamp, cached = _stamp(path), self._contents.get((kind, path))
             if cached is None or cached[0] != stamp:
@@ -132,11 +132,11 @@ class SceneCache:
 
 
 def _stamp(path: Path) -> tuple[int, int]:
-    """Time and size of a file; zeros where there is none."""
+    """Return time and size of a file; zeros if it does not exist."""
     return (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)
 
 
 def _named(transforms: Path, key: str) -> list[Path | None]:
-    """The file that each frame of a transforms.json, as the step `capture` writes it, names under a key."""
+    """List the file under a key of each frame of a transforms.json from the step `capture`."""
     content = json.loads(transforms.read_text(encoding="utf-8")) if transforms.is_file() else {"frames": []}
     return [transforms.parent / frame[key] if key in frame else None for frame in content["frames"]]

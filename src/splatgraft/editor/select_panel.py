@@ -32,15 +32,15 @@ _SOURCES = {
 }
 _KEEP: dict[str, Keep] = {"all large pieces": "substantial", "only the largest piece": "largest", "all pieces": "all"}
 _TAKES_POINTS = (None, "auto", "grabcut", "sam2")
-"""Values of `mask_source` of which clicks count."""
+"""Values of `mask_source` that use clicks."""
 _GREEN, _RED, _ORANGE = "#3cdc5a", "#eb283c", "#ff9628"
 
 
 class SelectPanel(Panel):
-    """Its controls, and the source in the view."""
+    """Controls of the selection, and the source in the view."""
 
     def __init__(self, editor: "Editor") -> None:
-        """Use no brush yet."""
+        """Start without the brush."""
         super().__init__(editor)
         self._marks_object, self._uses_brush, self._adds, self._is_alone = True, False, False, False
         self._brush_size = 0.1
@@ -48,7 +48,7 @@ class SelectPanel(Panel):
         self._touched: Tensor | None = None
         self._held_box: BoxDrag | None = None
         self._outlines: tuple[EditState | None, dict[int, Any]] = (None, {})
-        """Outlines that the clicks of one state give, by photo."""
+        """Outlines by the clicks of one state, for each photo."""
         self._finder = LatestOnlyWorker(self._find_outline, lambda error: editor.say(str(error), bad=True))
 
     def close(self) -> None:
@@ -56,16 +56,16 @@ class SelectPanel(Panel):
         self._finder.close()
 
     def enter(self) -> None:
-        """Begin at a photo, of which clicks are plain."""
+        """Begin at the first photo."""
         if self.editor.session is not None and self.editor.cameras() is not None:
             self.editor.to_photo(0)
 
     def leave(self) -> None:
-        """Put the brush away."""
+        """Switch the brush off."""
         self._uses_brush, self._stroke, self._touched = False, [], None
 
     def build(self, form: Form) -> None:
-        """Describe the controls."""
+        """Add the controls."""
         editor, session = self.editor, self.editor.require_session()
         if not session.files.source_scene.is_file():
             form.note("The scene with the object is not there yet: see Open.")
@@ -134,7 +134,7 @@ class SelectPanel(Panel):
         return "What is in the box is orange. Cut it out, or click on the object in two or three photos first."
 
     def _warnings(self, session: Session) -> list[str]:
-        """Masks that the capture names, and that are missing."""
+        """Return a warning about missing masks of the capture."""
         missing = session.scenes.missing_masks(session.files.source_cameras)
         if not missing:
             return []
@@ -144,13 +144,13 @@ class SelectPanel(Panel):
         return [f"Mask {names} is missing." if len(missing) == 1 else f"Masks {names} are missing."]
 
     def tools(self) -> dict[str, Any]:
-        """Strokes of the brush, and rectangles."""
+        """Offer strokes of the brush, and rectangles."""
         return {"paint": self._uses_brush, "rectangle": True}
 
     # the picture
 
     def picture(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
-        """The source, or a photo of it, with what is selected."""
+        """Draw the source, or a photo of it, with the selection."""
         session, pictures = self.editor.require_session(), self.editor.pictures
         assert pictures is not None
         which = session.selection()
@@ -159,7 +159,7 @@ class SelectPanel(Panel):
         return pictures.draw_source(which, camera, photo=view.photo, alone=self._is_alone), "full quality"
 
     def overlay(self, view: View, camera: Cameras) -> dict[str, Any]:
-        """Clicks and the outline that they give in a photo; the box elsewhere."""
+        """Describe the clicks and their outline in a photo, or the box elsewhere."""
         session, pictures = self.editor.require_session(), self.editor.pictures
         assert pictures is not None
         dots: list[dict[str, Any]] = []
@@ -181,7 +181,7 @@ class SelectPanel(Panel):
         return {"dots": dots, "lines": lines}
 
     def _outline(self, session: Session, photo: int) -> list[list[tuple[float, float]]]:
-        """The outline in a photo; where it is not known yet, it is looked for."""
+        """Return the outline in a photo; start its computation if it is not known yet."""
         state = session.state
         if not state.prompts or state.mask_source not in _TAKES_POINTS:
             return []
@@ -207,7 +207,7 @@ class SelectPanel(Panel):
     # the pointer
 
     def pointer(self, view: View, pointer: Pointer) -> None:
-        """Take clicks, strokes, rectangles and drags of the box."""
+        """Handle clicks, strokes, rectangles and drags of the box."""
         if pointer.what == "rectangle":
             camera = view_camera(self.editor, view)
             (x, y), (u, v) = pointer.place, pointer.to
@@ -221,7 +221,7 @@ class SelectPanel(Panel):
             self._mark(view, pointer)
 
     def _mark(self, view: View, pointer: Pointer) -> None:
-        """Add a point to the photo in view, else to the one that sees the surface most alike, and show that."""
+        """Add a point to the photo in view, or to the one with the most similar direction, and show it."""
         editor, session, pictures = self.editor, self.editor.require_session(), self.editor.pictures
         assert pictures is not None
         cameras, photo = session.scenes.cameras(session.files.source_cameras), view.photo
@@ -300,7 +300,7 @@ class SelectPanel(Panel):
         self.editor.say(f"{'added' if add else 'removed'} what the stroke touched. {again}")
 
     def key(self, view: View, key: str) -> bool:
-        """B takes the brush or puts it away."""
+        """Switch the brush on or off on B."""
         if key == "b":
             self._use_brush(not self._uses_brush)
         return key == "b"
@@ -322,7 +322,7 @@ class SelectPanel(Panel):
             self._correct(box.contains(self._scene().means), add=add)
 
     def _default_box(self) -> Box:
-        """The box around the cameras' common focus; where there is no capture, the middle half of the scene."""
+        """Return the box around the cameras' focus, or the middle half of the scene if there is no capture."""
         session = self.editor.require_session()
         try:
             return default_box(session.scenes.capture(session.files.source_cameras))

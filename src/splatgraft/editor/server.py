@@ -1,7 +1,7 @@
-"""The editor's web server: one page, one websocket for each window, files, uploads, and access control before all.
+"""The editor's web server: one page, one websocket for each window, files and uploads, all behind access control.
 
-What a client sends is bounded: the size of a message and of an upload, and the number of windows. The oldest window
-edits, all others watch. A message that no page sends is one line on standard error. Nothing here loads torch.
+The sizes of messages and uploads and the number of windows are limited. The oldest window edits, all others watch. An
+invalid message gives one line on standard error. This module does not load torch.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ from splatgraft.editor.access import allowed_query, cookie_name, why_refused
 from splatgraft.runtime.files import atomic_write
 
 FILES_PREFIX = "files/"
-"""First part of the addresses of the project's files, below the page's own address."""
+"""Prefix of the addresses of the project's files, relative to the page."""
 _ASSETS = {"": "index.html", "editor.js": "editor.js", "editor.css": "editor.css"}
 _TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -44,57 +44,57 @@ _TYPES = {
 }
 _POLICY = "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'"
 _MAX_MESSAGE_BYTES = 1 << 16  # a page's largest message is a path or a file's name
-_MAX_UPLOAD_BYTES = 1 << 30  # of one upload, which goes to the disk
-_MAX_WINDOWS = 16  # each is drawn for
-_MAX_UPLOADS = 4  # under way at once
+_MAX_UPLOAD_BYTES = 1 << 30  # one upload, which is written to disk
+_MAX_WINDOWS = 16  # each takes drawing time
+_MAX_UPLOADS = 4  # at the same time
 _MAX_EARLY = 64  # messages kept until a client is attached; a page sends two when it opens
 _NOT_OURS = (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError)
-"""Errors of a message that no page sends."""
+"""Errors that an invalid message can raise."""
 _START_SECONDS = 60  # limit against a hang
 
 
 class Client(Protocol):
-    """What the server tells of its windows; `Editor` is one."""
+    """Receiver of the events of windows, implemented by `Editor`."""
 
     def opened(self, window: "Window") -> None:
-        """A window has opened."""
+        """Handle a new window."""
 
     def received(self, window: "Window", message: dict[str, Any]) -> None:
-        """A window has sent a message; ValueError, KeyError or TypeError where no page sends it."""
+        """Handle a window's message; raise ValueError, KeyError or TypeError if it is invalid."""
 
     def closed(self, window: "Window") -> None:
-        """A window has closed."""
+        """Handle a closed window."""
 
     def file(self, name: str) -> Path | None:
-        """The file that is served for a name; None where there is none."""
+        """Return the file to serve for a name; None if it does not exist."""
 
     def upload_path(self, name: str) -> Path:
-        """Where an uploaded file of that name goes; ValueError where the name is none."""
+        """Return the path for an uploaded file; raise ValueError if its name is invalid."""
         ...
 
     def uploaded(self, path: Path, use: str) -> None:
-        """A file was uploaded for the control `use`."""
+        """Handle a file uploaded for the control `use`."""
 
 
 class Window:
     """One browser window. Only the newest message of each kind waits to be sent."""
 
     def __init__(self, number: int, loop: asyncio.AbstractEventLoop) -> None:
-        """Send nothing yet."""
+        """Start without messages."""
         self.number = number
         self._loop, self._wake = loop, asyncio.Event()
         self._waiting: dict[str, str | bytes] = {}
         self._lock = threading.Lock()
 
     def send(self, kind: str, content: str | bytes) -> None:
-        """Send a message from any thread; it replaces one of that kind that still waits."""
+        """Send a message from any thread; it replaces a waiting one of that kind."""
         with self._lock:
             self._waiting[kind] = content
         with contextlib.suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._wake.set)
 
     async def pump(self, connection: WebSocket) -> None:
-        """Send what waits until the connection ends."""
+        """Send waiting messages until the connection ends."""
         while True:
             await self._wake.wait()
             self._wake.clear()
@@ -108,7 +108,7 @@ class Window:
 
 
 class Server:
-    """The server in a thread of its own."""
+    """The server, in its own thread."""
 
     def __init__(self, token: str, *, host: str, port: int) -> None:
         """Start to listen at `port` or the next free one; each request must carry the token."""
@@ -140,7 +140,7 @@ class Server:
         self._thread.start()
 
     def attach(self, client: Client) -> None:
-        """Tell a client of the windows from now on, and of those that are open."""
+        """Send events of windows to a client from now on, first those of open windows."""
         with self._lock:
             self._client = client
             for window in self._windows:
@@ -173,7 +173,7 @@ class Server:
         return response
 
     async def _file(self, request: Request) -> Response:
-        """A file of the project."""
+        """Send a file of the project."""
         try:
             found = None if self._client is None else self._client.file(request.path_params["name"])
             if found is None or not found.is_file():
@@ -183,7 +183,7 @@ class Server:
             return _no_file()
 
     async def _upload(self, request: Request) -> Response:
-        """Store a file that the window that edits sends; it goes to the disk part by part."""
+        """Store a file from the editing window; it is written to disk part by part."""
         query, client = request.query_params, self._client
         with self._lock:
             is_editing = bool(self._windows) and query.get("window") == str(self._windows[0].number)
@@ -264,13 +264,13 @@ def _pass_on(client: Client, window: Window, message: dict[str, Any]) -> None:
 
 
 def _say_foreign(error: Exception) -> None:
-    # not the error's text, which may quote what was sent
+    # without the error's text, which may quote the message
     found = f"one that is not ({type(error).__name__})"
     sys.stderr.write(f"splatgraft: expected a message of the editor's own page, found {found}\n")
 
 
 class _Guard:
-    """Access control before an application, and headers behind it."""
+    """Access control of an application's requests, and headers of its responses."""
 
     def __init__(self, app: ASGIApp, token: str) -> None:
         self._app, self._token = app, token
@@ -279,7 +279,7 @@ class _Guard:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        # a repeated header is joined, so that it matches no accepted value
+        # repeated headers are joined, because the result matches no accepted value
         headers: dict[str, str] = {}
         for raw, value in scope["headers"]:
             name, text = raw.decode("latin-1").title(), value.decode("latin-1")
@@ -295,7 +295,7 @@ class _Guard:
         async def guarded(message: Any) -> None:
             if message["type"] == "http.response.start":
                 found = {name.lower() for name, _ in message["headers"]}
-                # no other site may embed the page in a frame (clickjacking), and the address holds the token
+                # against frames of other sites (clickjacking), and against leaks of the token in the address
                 extra = {
                     "X-Frame-Options": "DENY",
                     "Referrer-Policy": "no-referrer",
@@ -314,7 +314,7 @@ class _Guard:
 
 
 def _listener(host: str, port: int) -> socket.socket:
-    """A socket at the port, or at the next free one."""
+    """Open a socket at the port, or at the next free one."""
     for tried in range(port, port + 100):
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, sys.platform != "win32")

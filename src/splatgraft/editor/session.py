@@ -26,7 +26,7 @@ from splatgraft.project.placement import ObjectPlacement, read_placement
 from splatgraft.segmentation import Box, add_correction, apply_corrections
 
 Stamps = tuple[tuple[int, int] | None, ...]
-"""Time and size of each file of the edits; None where there is none."""
+"""Time and size of each file of the edits; None for a missing file."""
 
 
 class Session:
@@ -50,7 +50,7 @@ class Session:
         self.state: EditState = read_state(files.file)
         """The current edits; `change` replaces them."""
         self.unsaved: str | None = None
-        """Why nothing can be saved at present; None where it can."""
+        """Reason why edits cannot be saved; None if they can."""
         saved, now = self._store.read_history(), self._store.name(self.state)
         # a change of the files while no editor was open is one more step
         self.history = History(now) if saved is None else saved if saved.present == now else saved.pushed(now)
@@ -59,7 +59,7 @@ class Session:
         self.save_again()
 
     def save_again(self) -> bool:
-        """Try to save the state and the history; whether there was room on the disk."""
+        """Try to save the state and the history; return whether the disk had room."""
         with self._lock:
             try:
                 self._store.save(self.state)
@@ -73,11 +73,11 @@ class Session:
             return True
 
     def change(self, state: EditState) -> None:
-        """Save a new state as one undo step; an unchanged one adds none.
+        """Save a new state in one undo step, unless it is unchanged.
 
         Raises:
-            ValueError: If a value is out of its range, the files were changed outside the editor, which loads that
-                change where it can be read, or they cannot be written.
+            ValueError: If a value is out of its range, the files cannot be written, or they were changed outside the
+                editor. A readable outside change is loaded.
         """
         check_state(state)
         with self._lock:
@@ -87,17 +87,17 @@ class Session:
                 self._apply(self.history.pushed(name), state)
 
     def undo(self) -> bool:
-        """Go back by one step; False where there is none. Raises as `change`."""
+        """Go back by one step; return False if there was no step. Raises as `change`."""
         return self._step(History.undone)
 
     def redo(self) -> bool:
-        """Go forward by one step; False where there is none. Raises as `change`."""
+        """Go forward by one step; return False if there was no step. Raises as `change`."""
         return self._step(History.redone)
 
     def reload(self) -> bool:
-        """Load changes made outside the editor as one undo step; whether there were any.
+        """Load changes made outside the editor in one undo step; return whether there were any.
 
-        ValueError where a file is invalid; nothing is saved until it is corrected.
+        Raise ValueError if a file is invalid; nothing is saved until it is corrected.
         """
         with self._lock:
             stamps = stamps_of(self.files.file)
@@ -150,7 +150,7 @@ class Session:
     # the selection in the source
 
     def selection(self) -> Bool[Tensor, "n"] | None:
-        """Flags of the source's Gaussians that are the object: segmented, else in the box, with corrections."""
+        """Flag the source's Gaussians of the object: segmented, or else in the box, with corrections."""
         if not self.files.source_scene.is_file():
             return None
         scene = self.scenes.gaussians(self.files.source_scene)
@@ -168,7 +168,7 @@ class Session:
         return apply_corrections(segmented, corrections) if fits else segmented
 
     def box(self) -> Box | None:
-        """The box around the object, in the source's world."""
+        """Return the box around the object, in the source's world."""
         numbers = self.state.box
         return None if numbers is None else Box(torch.tensor(numbers[:3]), torch.tensor(numbers[3:]))
 
@@ -182,7 +182,7 @@ class Session:
     # the objects in the target
 
     def objects(self) -> tuple[ObjectPlacement, ...]:
-        """The placed objects: as edited, else as `compose` placed them."""
+        """Return the placed objects, as edited or as `compose` placed them."""
         if self.state.objects is not None:
             return self.state.objects
         files = self.files
@@ -200,15 +200,15 @@ class Session:
         return self._composed[1]
 
     def placed_state(self) -> EditState:
-        """The current state with the objects that `compose` placed filled in."""
+        """Return the current state with the objects of `compose` filled in."""
         return self.state if self.state.objects is not None else replace(self.state, objects=self.objects())
 
     def placeable_object(self, index: int) -> PlaceableObject:
-        """A placed object with its base."""
+        """Return a placed object with its base."""
         return self.scenes.placeable_object(self.objects()[index])
 
     def up(self, side: str = "target") -> Float[Tensor, "3"]:
-        """Up direction of the target, or of the source."""
+        """Return the up direction of the target, or of the source."""
         cameras = self.scenes.cameras(self.files.source_cameras if side == "source" else self.files.target_cameras)
         return self.scenes.derive(f"up {side}", (cameras,), lambda: estimate_up(cameras))
 
@@ -220,7 +220,7 @@ class Session:
     # metric sizes
 
     def size(self, index: int) -> ObjectSize:
-        """The size of one placed object; ValueError where a scale.json cannot be read."""
+        """Return the size of one placed object; raise ValueError if a scale.json cannot be read."""
         item = self.objects()[index]
         is_own = self.scenes.object_path(item) == self.files.object
         return ObjectSize(
@@ -231,12 +231,12 @@ class Session:
         )
 
     def true_scale(self) -> float | None:
-        """The scale at which the source's object is as large as it was; None where a capture's scale is not known."""
+        """Return the scale that keeps the true size of the source's object; None if a capture's scale is unknown."""
         own, place = read_scale(self.files.source_cameras), read_scale(self.files.target_cameras)
         return None if own is None or place is None else own.metres_per_unit / place.metres_per_unit
 
     def set_own_scale(self, index: int, true_cm: float) -> Path:
-        """Store the scale of an object's own capture from the object's true height; gives the file."""
+        """Store the scale of an object's own capture from the object's true height; return the file."""
         check_height_cm(true_cm)
         path = self.scenes.object_path(self.objects()[index])
         if path != self.files.object:
@@ -247,7 +247,7 @@ class Session:
         return write_scale(self.files.source_cameras, found)
 
     def set_place_scale(self, index: int, here_cm: float) -> Path:
-        """Store the scale of the target's capture from a placed object's height in it; gives the file."""
+        """Store the scale of the target's capture from a placed object's height in it; return the file."""
         check_height_cm(here_cm)
         size = self.size(index)
         found = MetricScale(0.01 * here_cm / (size.scale * size.height), f"a placed object's height of {here_cm:g} cm")
@@ -256,11 +256,11 @@ class Session:
     # jobs
 
     def start_job(self, words: tuple[str, ...], title: str) -> None:
-        """Start a child process that runs a command, which is given by the words after `splatgraft`."""
+        """Start a child process that runs `splatgraft` with the given arguments."""
         self.jobs.start(self.project.job_command(words, title), title=title, shown=words)
 
     def why_stale(self, *steps: str) -> str | None:
-        """Why the result of one of these steps is out of date, with the first step that is; None where none is."""
+        """Return the original reason why one of these steps is out of date; None if all are up to date."""
         found = self.project.reasons()
         if PROBLEM in found:
             return found[PROBLEM]
@@ -274,7 +274,7 @@ class Session:
 
 
 def disk_full(error: BaseException | None) -> bool:
-    """Whether an error was caused by a lack of room on the disk."""
+    """Return whether an error was caused by a full disk."""
     while error is not None:
         if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
             return True
@@ -283,6 +283,6 @@ def disk_full(error: BaseException | None) -> bool:
 
 
 def stamps_of(project: Path) -> Stamps:
-    """The present stamps of the edits' files."""
+    """Return the current stamps of the edits' files."""
     files = state_files(project)
     return tuple((p.stat().st_mtime_ns, p.stat().st_size) if p.is_file() else None for p in files)

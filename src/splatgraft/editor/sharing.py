@@ -1,4 +1,4 @@
-"""What of a project can be shared: kinds of files, their names and parts, and the files that were written."""
+"""Files that a project can share, with their kinds, names and parts, and those already written."""
 
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -17,7 +17,7 @@ class ShareKind:
     suffix: str
     """Suffix of the file, with the dot; it names the format."""
     page: ExportPage = "viewer"
-    """What an .html holds; the report has no parts."""
+    """Contents of an .html; the report has no parts."""
     module: str | None = None
     """An optional module that the format needs."""
 
@@ -37,7 +37,7 @@ SHARE_KINDS: dict[str, ShareKind] = {
     "Scene, old viewers (.splat)": ShareKind(".splat"),
     "Scene, glTF (.glb)": ShareKind(".glb"),
 }
-"""By the name that a user chooses."""
+"""Kinds of files, by the label in the menu."""
 
 PARTS: dict[str, Layer] = {
     "all": "all",
@@ -46,11 +46,11 @@ PARTS: dict[str, Layer] = {
     "object with shadow": "object-with-shadow",
     "shadow alone": "shadow",
 }
-"""Parts of the scene, by the name that a user chooses."""
+"""Parts of the scene, by the label in the menu."""
 
 
 def why_not(files: ProjectFiles, kind: ShareKind) -> str | None:
-    """Why this kind cannot be written yet, and what to do; None where it can."""
+    """Return why this kind cannot be written yet, with the remedy; None if it can."""
     if kind.module is not None and find_spec(kind.module) is None:
         extra = extra_providing(kind.module)
         return f"{kind.suffix}: needs a package that is not installed: pip install 'splatgraft[{extra}]'"
@@ -61,31 +61,31 @@ def why_not(files: ProjectFiles, kind: ShareKind) -> str | None:
 
 
 def export_path(files: ProjectFiles, kind: ShareKind, layer: Layer) -> Path:
-    """Where a shared file is written; its name says the project and the part."""
+    """Return the path of a shared file, named by the project and the part."""
     part = "_report" if kind.page == "report" else "" if layer == "all" else f"_{layer.replace('-', '_')}"
     return files.root / EXPORTS_FOLDER / f"{files.root.resolve().name or 'scene'}{part}{kind.suffix}"
 
 
 def has_report(files: ProjectFiles) -> bool:
-    """Whether the report's page was written."""
+    """Return whether the report's page was written."""
     return (files.report / REPORT_FILE).is_file()
 
 
 def step_shown(files: ProjectFiles, *, is_report: bool) -> str:
-    """The step whose result a shared file shows."""
+    """Return the step whose result a shared file shows."""
     if is_report:
         return "evaluate"
     return "consolidate" if files.result.is_file() else "relight"
 
 
 def written_exports(files: ProjectFiles) -> tuple[Path, ...]:
-    """The shared files, the newest first."""
+    """List the shared files, newest first."""
     found = [path for path in (files.root / EXPORTS_FOLDER).glob("[!.]*") if path.is_file()]
     return tuple(sorted(found, key=lambda path: (-path.stat().st_mtime_ns, path.name)))
 
 
 def served_file(files: ProjectFiles, name: str) -> Path | None:
-    """The file of the report, or the shared file, that the page's server gives for a name; None for any other name."""
+    """Return the report's file or the shared file to serve for a name; None for any other name."""
     is_export = name.startswith(f"{EXPORTS_FOLDER}/")
     folder = (files.root / EXPORTS_FOLDER if is_export else files.report).resolve()
     path = (folder / name.removeprefix(f"{EXPORTS_FOLDER}/" if is_export else "")).resolve()

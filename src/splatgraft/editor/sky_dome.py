@@ -26,16 +26,16 @@ _LOWEST, _HIGH = 25.0, 55.0
 
 @dataclass(frozen=True)
 class SkyDome:
-    """Which way a picture of the sky is turned."""
+    """Orientation of a picture of the sky."""
 
     up: Float[Tensor, "3"]
     """Unit up direction of the world."""
     forward: Float[Tensor, "3"]
-    """Unit direction at a right angle to `up`: where the viewer looks, which is the picture's upper end."""
+    """Unit direction of view at a right angle to `up`; it is the picture's upper end."""
 
     @staticmethod
     def seen_along(direction: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> "SkyDome":
-        """The picture for a viewer who looks along a direction."""
+        """Return the picture for a viewer who looks along a direction."""
         level = direction - (direction @ up) * up
         if float(level.norm()) < 1e-6:
             level = torch.eye(3)[int(up.abs().argmin())]
@@ -44,11 +44,11 @@ class SkyDome:
 
     @property
     def right(self) -> Float[Tensor, "3"]:
-        """The picture's right."""
+        """Unit direction of the picture's right."""
         return torch.linalg.cross(self.forward, self.up)
 
     def point(self, direction: Float[Tensor, "3"]) -> tuple[float, float]:
-        """Right and down of a direction in the picture, over the horizon's radius; below the horizon: at it."""
+        """Project a direction to right and down in the picture, over the horizon's radius, at most 1."""
         height = math.asin(max(-1.0, min(1.0, float(direction @ self.up))))
         radius = min(1.0, (math.pi / 2 - height) / (math.pi / 2))
         x, y = float(direction @ self.right), -float(direction @ self.forward)
@@ -56,11 +56,11 @@ class SkyDome:
         return radius * x / length, radius * y / length
 
     def direction(self, x: float, y: float) -> Float[Tensor, "3"]:
-        """The unit direction of a point of the picture; outside the horizon: at it."""
+        """Return the unit direction of a point of the picture, not below the horizon."""
         return self._directions(torch.tensor([[x, y]]))[0]
 
     def words(self, source: LightSource) -> str:
-        """Where a light is, as one says it: 'from the left, high'."""
+        """Describe a light's direction, such as 'from the left, high'."""
         direction = torch.tensor(source.direction)
         height = math.degrees(math.asin(max(-1.0, min(1.0, float(direction @ self.up)))))
         x, y = self.point(direction)
@@ -71,11 +71,11 @@ class SkyDome:
         return f"{side}, {'low' if height < _LOWEST else 'half high' if height < _HIGH else 'high'}"
 
     def svg(self, light: Light) -> str:
-        """The picture as SVG; a source is a dot whose area is its share, with its number as `data-source`."""
+        """Draw the picture as SVG; sources are dots sized by their share, with numbers as `data-source`."""
         dots = []
         for index, source in enumerate(light.sources):
             x, y = (_RADIUS * value for value in self.point(torch.tensor(source.direction)))
-            # as `Light.describe`: of the light on what faces it
+            # share of the light on a surface that faces the source, as in `describe_light`
             share = sum(source.irradiance) / float(light.irradiance(torch.tensor(source.direction)[None]).sum())
             peak = max(*source.irradiance, 1e-9)
             r, g, b = (round(255 * max(0.0, value / peak) ** (1 / 2.2)) for value in source.irradiance)
@@ -100,7 +100,7 @@ class SkyDome:
         return height.sin() * self.up + height.cos() * level
 
     def _ambient(self, light: Light) -> str:
-        """The ambient light of the upper half as an image's address; its brightest place is white."""
+        """Encode the ambient light of the upper half as a data URL, relative to its maximum."""
         axis = (torch.arange(_PIXELS) + 0.5) / _PIXELS * 2 - 1
         y, x = torch.meshgrid(axis, axis, indexing="ij")
         radiance = light.ambient_radiance(self._directions(torch.stack([x.ravel(), y.ravel()], 1)))

@@ -1,4 +1,4 @@
-"""The edits of a project as one immutable value, and the limits of its numbers."""
+"""The edits of a project as an immutable value, and the limits of its numbers."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -20,11 +20,11 @@ BoxNumbers = tuple[float, float, float, float, float, float]
 _SCALES = (1e-6, 1e6)
 """Range of an object's scale; beyond it covariances leave the range of float32."""
 _COORDINATES = (-1e6, 1e6)
-"""World units: beyond, float32 resolves less than a tenth of a unit."""
+"""World units; beyond, the resolution of float32 is coarser than about 0.1."""
 _HEIGHTS_CM = (1e-3, 1e7)
 """Heights that can be typed: from a hundredth of a millimetre to a hundred kilometres."""
 _WEIGHTS, _STOPS = (0.0, 100.0), (-16.0, 16.0)
-"""Weights of a layer of the light transfer, and exposure and warmth of the objects in stops."""
+"""Weights of layers of the light transfer, and exposure and warmth in stops."""
 _ORTHONORMAL = 1e-3
 """Largest deviation of a rotation from orthonormality: typed angles and float32 stay below 1e-6."""
 
@@ -44,7 +44,7 @@ class EditState:
     box: BoxNumbers | None = None
     """Box around the object in the source's world: minimum x, y, z, then maximum."""
     keep: str | None = None
-    """Which connected pieces of the selection are kept: `keep` of [segment]."""
+    """Rule for keeping connected pieces of the selection: `keep` of [segment]."""
     prompts: Mapping[str, ViewPrompt] | None = None
     """Points and rectangles in photos of the source, by the photo's name: `prompts` of [segment]."""
     light: Light | None = None
@@ -55,18 +55,18 @@ class EditState:
     """Name of the harmonisation method."""
 
     def with_object(self, index: int, item: ObjectPlacement) -> "EditState":
-        """The state with another placement of one object."""
+        """Return the state with one object replaced."""
         assert self.objects is not None
         return replace(self, objects=(*self.objects[:index], item, *self.objects[index + 1 :]))
 
 
 def check_state(state: EditState) -> None:
-    """Check all values of a state, so that none makes a project unreadable; ValueError in one line."""
+    """Check all values of a state, so that the project stays readable; raise ValueError in one line."""
     for index, item in enumerate(state.objects or ()):
         _check_placement(item, f"object {index + 1}")
     if state.box is not None:
         check_numbers(state.box, "box")
-        # in float32, in which the box is used
+        # in float32, as the box is used
         lower, upper = torch.tensor(state.box[:3]), torch.tensor(state.box[3:])
         if not bool((lower < upper).all()):
             raise ValueError(f"box: expected lower < upper, found {list(state.box[:3])} and {list(state.box[3:])}")
@@ -80,7 +80,7 @@ def check_state(state: EditState) -> None:
 
 
 def check_numbers(values: Iterable[float], where: str) -> None:
-    """Check that typed or dragged numbers are finite and not above the largest coordinate, as `check_state` does."""
+    """Check that typed or dragged numbers are in the range of coordinates, as `check_state` does."""
     for value in values:
         _check_number(value, where, _COORDINATES)
 

@@ -1,5 +1,4 @@
-"""The edits of a project in its files: project.toml, placement.json, erased.npy, corrections.npy, prompts.json and
-light.json."""
+"""The edits in their files: project.toml, placement.json, erased.npy, corrections.npy, prompts.json, light.json."""
 
 import json
 from collections.abc import Mapping
@@ -23,13 +22,13 @@ _KEYS_OF_FILES = {"corrections": "corrections", "prompts": "prompts", "given_lig
 
 
 def read_state(project: Path) -> EditState:
-    """Read the state from project.toml and the files beside it; ValueError in one line that names an invalid file."""
+    """Read the state from project.toml and the files beside it; raise ValueError, in one line, for an invalid file."""
     content, folder = read_toml(project), project.parent
     segment, relight, harmonize = (_table(content, name, project) for name in ("segment", "relight", "harmonize"))
     placement, file = folder / PLACEMENT_FILE, project
     given, corrections, prompts = relight.get("given_light"), segment.get("corrections"), segment.get("prompts")
     values: dict[str, Any] = {}
-    # a file may hold anything: numbers beyond float's range, a path of the wrong type, nesting without end
+    # a file may hold numbers beyond float's range, a path of the wrong type, or endless nesting
     try:
         values |= {key: segment[key] for key in ("mask_source", "keep") if key in segment}
         values |= {"box": _six(segment["box"], project)} if "box" in segment else {}
@@ -54,10 +53,10 @@ def read_state(project: Path) -> EditState:
 
 
 def write_state(project: Path, before: EditState, after: EditState) -> None:
-    """Update the files from state `before` to state `after`; what both agree on stays untouched.
+    """Update the files from state `before` to state `after`; equal parts stay untouched.
 
-    Files that project.toml refers to are written before it, so that it never refers to a missing file. ValueError
-    where project.toml cannot be changed line by line.
+    Files are written before project.toml, which must not refer to a missing file. Raise ValueError if project.toml
+    cannot be changed line by line.
     """
 
     def is_new(name: str) -> bool:
@@ -66,7 +65,7 @@ def write_state(project: Path, before: EditState, after: EditState) -> None:
     folder, old = project.parent, project.read_text(encoding="utf-8")
     text, new_keys, old_keys = old, _keys(after), _keys(before)
     for (table, key), value in new_keys.items():
-        # the file of what was changed may have another name, given by hand
+        # the file of a changed field may have another name, set by hand
         is_file = key in _KEYS_OF_FILES and is_new(_KEYS_OF_FILES[key])
         if is_file or json.dumps(value) != json.dumps(old_keys[table, key]):
             text = with_keys(text, table, {key: value})
@@ -90,20 +89,20 @@ def write_state(project: Path, before: EditState, after: EditState) -> None:
 
 
 def as_written(state: EditState, before: EditState) -> EditState:
-    """The state as it is read back: light.json rounds to six digits. A light shared with `before` stays identical."""
+    """Round the light to six digits, as light.json does; a light shared with `before` stays identical."""
     if state.light is None or state.light is before.light:
         return state
     return replace(state, light=light_from_json(light_to_json(state.light)))
 
 
 def state_files(project: Path) -> tuple[Path, ...]:
-    """All files that hold the state."""
+    """Return all files that hold the state."""
     names = (PLACEMENT_FILE, ERASED_FILE, _CORRECTIONS_FILE, _PROMPTS_FILE, LIGHT_FILE)
     return (project, *(project.parent / name for name in names))
 
 
 def _keys(state: EditState) -> dict[tuple[str, str], Any]:
-    """All keys of the editor by table and name."""
+    """Return all keys of the editor by table and name."""
     segment = {
         "mask_source": state.mask_source,
         "box": state.box,
@@ -111,7 +110,7 @@ def _keys(state: EditState) -> dict[tuple[str, str], Any]:
         "corrections": None if state.corrections is None else _CORRECTIONS_FILE,
         "prompts": None if state.prompts is None else _PROMPTS_FILE,
     }
-    # what is physically right is the default and needs no key
+    # a default, which is physically correct, needs no key
     usual = asdict(LayerWeights())
     relight = {key: None if value == usual[key] else value for key, value in asdict(state.weights).items()}
     relight["given_light"] = None if state.light is None else LIGHT_FILE

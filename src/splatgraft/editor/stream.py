@@ -1,7 +1,7 @@
-"""One stream of pictures for each window: camera, canvas and state go in, the newest picture comes out.
+"""A stream of pictures for each window, drawn from its camera, its canvas and the state.
 
-Moving pictures have the resolution that a time budget allows. When nothing has moved for a moment, one of full size and
-quality follows.
+The resolution of moving pictures follows a time budget. When nothing has moved for a moment, a picture of full size
+and quality is drawn.
 """
 
 import io
@@ -20,65 +20,65 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.editor.orbit import Orbit
 from splatgraft.editor.server import Window
 
-_BUDGET_SECONDS = 1 / 20  # of a moving picture; sending and showing it takes the rest of a fifteenth
+_BUDGET_SECONDS = 1 / 20  # to draw a moving picture; sending and showing it takes the rest of 1/15 s
 _SMALLEST = 0.3  # share of the canvas's sides; smaller pictures take hardly less time, because all Gaussians are sorted
-_REST_SECONDS = 0.25  # without a move, until the picture of full size is begun
-_MOVING_QUALITY, _FULL_QUALITY = 80, 92  # of JPEG
-_LARGEST, _LEAST = 1920, 16  # pixels of a canvas's longer side, which the browser enlarges, and of any side
-_IN_FLIGHT = 2  # pictures on their way: one is shown while the next one is drawn
-_LOST_SECONDS = 2.0  # after which a picture that was not acknowledged counts as shown
+_REST_SECONDS = 0.25  # time without a move before the picture of full size is drawn
+_MOVING_QUALITY, _FULL_QUALITY = 80, 92  # JPEG, 0 to 100
+_LARGEST, _LEAST = 1920, 16  # pixels; largest longer side, which the browser enlarges, and smallest side
+_IN_FLIGHT = 2  # unacknowledged pictures: one is shown while the next one is drawn
+_LOST_SECONDS = 2.0  # time after which an unacknowledged picture counts as shown
 
 
 @dataclass(eq=False)
 class View:
-    """What one window shows."""
+    """The view of one window."""
 
     window: Window
     size: tuple[int, int] = (0, 0)
-    """Width and height of its canvas, pixels; zeros until it has told."""
+    """Width and height of the canvas, pixels; zeros until they are known."""
     orbits: dict[str, Orbit] = field(default_factory=dict)
-    """Its view of each scene, by side."""
+    """Camera in each scene, by side."""
     split: float = 0.0
-    """Share of the width left of which the picture before is shown."""
+    """Position of the divider over the width; the comparison picture is left of it."""
     version: int = 0
-    """Grows when something changes that its picture shows."""
+    """Number of changes of the picture's content."""
     drawn: tuple[int, float] = (-1, 0.0)
-    """Version and size, over the canvas's, of the picture that was drawn last."""
+    """Version of the last picture, and its size over the canvas's."""
     photo: int | None = None
-    """Number of the photo from whose place it looks; None: from elsewhere."""
+    """Index of the photo whose camera is shown; None for other cameras."""
     moved_at: float = 0.0
-    """When it moved last."""
+    """Time of the last move, seconds of `time.monotonic`."""
     sent: int = 0
     """Number of pictures sent."""
     shown: int = 0
-    """Number of the newest picture that its window has shown."""
+    """Number of the newest picture that the window has shown."""
     sent_at: float = 0.0
     scale: float = 0.5
     """Size of moving pictures over the canvas's."""
 
     def touched(self, *, moving: bool) -> None:
-        """Say that what it shows has changed."""
+        """Count a change of the picture's content."""
         self.version += 1
         if moving:
             self.moved_at = time.monotonic()
 
     @property
     def canvas(self) -> tuple[int, int]:
-        """Width and height of its full picture."""
+        """Width and height of the full picture, pixels."""
         most = min(1.0, _LARGEST / max(self.size))
         width, height = (max(_LEAST, round(most * side)) for side in self.size)
         return width, height
 
 
 class Artist(Protocol):
-    """Draws; `Editor` is one."""
+    """Source of pictures, implemented by `Editor`."""
 
     def draw(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], dict[str, Any]]:
-        """A picture of a window's view, and what lies over it."""
+        """Draw a window's view and its overlay."""
         ...
 
     def orbit(self, view: View) -> Orbit | None:
-        """Where a window looks from; None where there is nothing to see."""
+        """Return a window's camera; None if there is no scene to show."""
         ...
 
 
@@ -86,51 +86,51 @@ class Stream:
     """The thread that draws for all windows, in turn."""
 
     def __init__(self, artist: Artist, on_error: Callable[[Exception], None]) -> None:
-        """Draw for no window yet."""
+        """Start the thread without windows."""
         self._artist, self._on_error = artist, on_error
         self.views: list[View] = []
-        """In the order in which their windows opened."""
+        """Views in the order in which their windows opened."""
         self._wake = threading.Condition()
         self._open = True
         self._thread = threading.Thread(target=self._run, name="splatgraft stream", daemon=True)
         self._thread.start()
 
     def add(self, view: View) -> None:
-        """Draw for a window from now on."""
+        """Start to draw for a window."""
         with self._wake:
             self.views.append(view)
             self._wake.notify_all()
 
     def remove(self, window: Window) -> None:
-        """Draw for a window no more."""
+        """Stop drawing for a window."""
         with self._wake:
             self.views = [view for view in self.views if view.window is not window]
 
     def of(self, window: Window) -> View | None:
-        """The view of a window; None where it has closed."""
+        """Return the view of a window; None if it has closed."""
         return next((view for view in self.views if view.window is window), None)
 
     def touch(self, view: View | None = None, *, moving: bool = False) -> None:
-        """Draw a window anew, or all."""
+        """Redraw one window, or all."""
         with self._wake:
             for one in self.views if view is None else [view]:
                 one.touched(moving=moving)
             self._wake.notify_all()
 
     def wait_drawn(self, view: View, seconds: float) -> None:
-        """Wait until a picture of what a window shows now is drawn, at most `seconds`."""
+        """Wait until a window's current content is drawn, at most `seconds`."""
         with self._wake:
             version = view.version
             self._wake.wait_for(lambda: view.drawn[0] >= version or not self._open, timeout=seconds)
 
     def acknowledge(self, view: View, number: int) -> None:
-        """A window has shown a picture."""
+        """Record that a window has shown a picture."""
         with self._wake:
             view.shown = max(view.shown, min(number, view.sent))
             self._wake.notify_all()
 
     def close(self) -> None:
-        """End the thread after the picture that it draws."""
+        """End the thread after the current picture."""
         with self._wake:
             self._open = False
             self._wake.notify_all()
@@ -159,7 +159,7 @@ class Stream:
 
     @staticmethod
     def _wait(view: View, now: float) -> float:
-        """Seconds until a window is to be drawn; infinite where nothing is to be."""
+        """Return the seconds until a window must be drawn; infinite if it is up to date."""
         version, size = view.drawn
         if not all(view.size) or (version == view.version and size == 1.0):
             return np.inf
@@ -193,7 +193,7 @@ class Stream:
 
 
 def jpeg(pixels: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
-    """A picture as JPEG, of a quality from 0 to 100."""
+    """Encode a picture as JPEG with a quality from 0 to 100."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, "JPEG", quality=quality)
     return stream.getvalue()

@@ -1,4 +1,4 @@
-"""The values of a light transfer, kept so that the next one after a move computes only what changed."""
+"""The values of a light transfer, kept so that the next one after a move computes only changed values."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -23,14 +23,14 @@ _SOURCE_LIGHT = "source light"  # name in the memo
 
 
 class TransferValues:
-    """The values of the last transfer, of which the next one takes what still holds."""
+    """The values of the last transfer, which the next one reuses while they are valid."""
 
     def __init__(self, clock: Callable[[], ClockSun | None]) -> None:
         """Start without values; `clock` reads the sun by the clock of the target's photos."""
         self._memo, self._clock = Memo(), clock
 
     def is_moved(self, composite: Composite, cameras: Cameras, light: Light | None, options: RelightOptions) -> bool:
-        """Whether objects were moved since the light of the scene was found."""
+        """Return whether objects were moved since the light of the scene was found."""
         kept = self._memo.peek(_kind(light), _light_inputs(composite, cameras, light, options))
         return kept is not None and kept[0] != _poses(composite)
 
@@ -44,7 +44,7 @@ class TransferValues:
         options: RelightOptions,
         exact: bool,
     ) -> Relit:
-        """The transfer as `relight` makes it; after a short move not `exact`: under the sources found before it."""
+        """Transfer the light as `relight` does; unless `exact`, keep the sources found before a short move."""
         pairs = enumerate(zip(composite.objects, sources, strict=True), 1)
         placed = [(number, one, source) for number, (one, source) in pairs if one.gaussians.count]
         if not placed:
@@ -61,7 +61,7 @@ class TransferValues:
     def share_source_light(
         self, pair: tuple[Gaussians, SourceScene], other: "TransferValues", theirs: tuple[Gaussians, SourceScene]
     ) -> None:
-        """Take the light at an object's old place that other values hold, instead of estimating it again.
+        """Copy the light at an object's old place from other values, instead of estimating it again.
 
         Args:
             pair: The object and its source scene here, for example with fewer Gaussians.
@@ -109,7 +109,7 @@ class TransferValues:
                 return moved
         source_light = None
         if source is not None:
-            # one for all: only the project's own object has a source, and its duplicates share it
+            # shared, because only the project's own object and its duplicates have a source
             pair = (placed.gaussians, source)
             source_light = self._memo.get(_SOURCE_LIGHT, pair, lambda: find_source_light(*pair))
         prepared = prepare_object(
@@ -120,7 +120,7 @@ class TransferValues:
 
 
 def _poses(composite: Composite) -> bytes:
-    """Where the objects are."""
+    """Return the objects' placements as bytes."""
     moves = [one.target_from_object for one in composite.objects]
     return b"".join(
         part.numpy().tobytes() for m in moves for part in (torch.tensor(m.scale), m.rotation, m.translation)
@@ -130,10 +130,10 @@ def _poses(composite: Composite) -> bytes:
 def _light_inputs(
     composite: Composite, cameras: Cameras, light: Light | None, options: RelightOptions
 ) -> tuple[Any, ...]:
-    """What the light of a scene is found from, but for the objects' places."""
+    """Return the inputs of a scene's light, except the objects' placements."""
     return (composite.target, composite.erased, cameras, light, options.reach, repr(options.sun_through))
 
 
 def _kind(light: Light | None) -> str:
-    """Name of the scene's light among kept values: an estimate is kept while another light is given."""
+    """Name the scene's light in the memo, which keeps an estimate while another light is given."""
     return "estimated light" if light is None else "given light"

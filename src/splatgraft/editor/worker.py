@@ -12,7 +12,7 @@ class LatestOnlyWorker(Generic[T]):
     """A thread with at most one waiting request."""
 
     def __init__(self, work: Callable[[T], None], on_error: Callable[[Exception], None]) -> None:
-        """Start the thread, which calls `work` with one request at a time, and `on_error` where that raises."""
+        """Start the thread, which calls `work` with one request at a time, and `on_error` if that raises."""
         self._work, self._on_error = work, on_error
         self._waiting: list[T] = []
         self._wake = threading.Condition()
@@ -33,11 +33,11 @@ class LatestOnlyWorker(Generic[T]):
 
     @property
     def closed(self) -> bool:
-        """Whether the worker was closed while it was at work: what it writes to may be gone."""
+        """Whether the worker was closed; the target of its output may be gone."""
         return not self._open
 
     def wait_idle(self, seconds: float) -> bool:
-        """Wait until a newer request arrives, at most `seconds`; whether none arrived."""
+        """Wait at most `seconds` for a newer request; return whether none arrived."""
         with self._wake:
             return not self._wake.wait_for(lambda: bool(self._waiting) or not self._open, timeout=seconds)
 
