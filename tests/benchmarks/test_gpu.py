@@ -29,6 +29,7 @@ def test_every_part_runs_at_toy_size(name, tmp_path):
     assert not gpu.is_finished(tmp_path / f"{name}.json", toy=False)
 
 
+@pytest.mark.long
 def test_finished_parts_are_kept_failures_are_said_and_all_is_in_one_table(tmp_path):
     done = {"part": "renderer", "toy": True, "seconds": 1.0, "rows": [{"gaussians": 300, "forward_ms": 1.25}]}
     (tmp_path / "renderer.json").write_text(json.dumps(done))

@@ -101,6 +101,7 @@ def test_a_changed_option_reruns_its_step_and_identical_results_go_no_further(
     assert stale(project, capsys) == {}
 
 
+@pytest.mark.long
 def test_each_step_also_takes_paths_and_makes_the_same(project: Path, tmp_path: Path) -> None:
     layout = read_flow(project).layout
     words = ["render", "--scene", str(layout.result / "scene.ply"), "--cameras", str(layout.capture("target"))]
@@ -201,6 +202,7 @@ def test_views_of_a_ground_truth_that_no_step_saw_are_measured_apart(project: Pa
     assert [row["held_out"] for row in metrics["per_view"]] == [True] + [False] * 7
 
 
+@pytest.mark.long
 def test_a_later_capture_is_made_by_a_second_process_and_its_failure_is_the_steps_own(
     project: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -151,6 +151,7 @@ def test_the_lamps_can_be_given_back_in_the_axes_of_the_capture(sunlit: Path):
             light_from_json(json.dumps(plain | {"world_from_capture": broken}), name="my.json")
 
 
+@pytest.mark.long
 def test_at_a_project_s_object_it_is_the_light_that_relight_finds(copy_project: Callable[[], Path], capsys):
     project = copy_project()
     out = project / "light.hdr"

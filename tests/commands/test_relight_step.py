@@ -62,6 +62,7 @@ def at(x: float, y: float, scale: float = 0.5) -> Similarity:
     return Similarity(scale, torch.eye(3), torch.tensor([x, y, 0.0]))
 
 
+@pytest.mark.long
 def test_copies_lose_the_same_old_light_and_a_strange_object_keeps_its_own(tmp_path: Path):
     # the copies stand where as much of the target is around them
     objects = {"strange.ply": (ball(), [at(0, 0.5)]), "own.ply": (ball(), [at(-0.2, 0), at(0.2, 0)])}

@@ -97,6 +97,7 @@ def test_the_report_begins_with_all_warnings_of_the_run(
     assert [line.split()[0] for line in stale] == ["evaluate"]
 
 
+@pytest.mark.long
 def test_a_side_without_photos_is_warned_of_with_a_picture_of_the_directions(
     copy_project: Callable[[], Path],
 ) -> None:

@@ -151,6 +151,7 @@ def written(session: Session, kind: str, part: str) -> tuple[Path, JobState]:
     return to, job
 
 
+@pytest.mark.long
 def test_a_job_writes_what_the_command_writes(result: Session, tmp_path: Path) -> None:
     to, job = written(result, "Scene, small (.sog)", "object with shadow")
     assert to == result.files.root / "export" / "a_ball_on_a_plane_object_with_shadow.sog"

@@ -205,6 +205,7 @@ def test_erased_flags_of_another_target_leave_the_page_usable(project: Path) -> 
         assert read_state(project).erased is None
 
 
+@pytest.mark.long
 def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) -> None:
     project.write_text(with_keys(project.read_text(), "relight", {"light": "off"}))
     assert main(["run", str(project), "--to", "consolidate"]) == 0

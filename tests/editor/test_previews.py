@@ -108,7 +108,7 @@ def test_a_finished_light_is_read_from_its_file(session: Session) -> None:
     assert lit.stage(replace(state, weights=LayerWeights(shadow=0.5))) == "draft"
 
 
-@pytest.mark.parametrize("light", [None, LIGHT])
+@pytest.mark.parametrize("light", [None, pytest.param(LIGHT, marks=pytest.mark.long)])
 def test_the_previewed_light_equals_the_step_s_result(session: Session, light: Light | None) -> None:
     session.change(replace(moved(session.placed_state()), weights=LayerWeights(shadow=0.5), light=light))
     relighting = RelitPreview(session.scenes)
@@ -159,6 +159,7 @@ def test_the_preview_of_a_photograph_is_unchanged(session: Session, tmp_path: Pa
     assert torch.equal(torch.from_numpy(photo), (stored * 255).round().to(torch.uint8))
 
 
+@pytest.mark.long
 def test_the_light_process_makes_drafts_of_what_is_asked_last(session: Session) -> None:
     answers: Queue[tuple[EditState, Lit]] = Queue()
     errors = MagicMock()
@@ -216,6 +217,7 @@ def test_each_gaussian_gets_the_light_of_the_nearest_coarse_one() -> None:
     assert lit.shaded(LayerWeights()).count == whole.count
 
 
+@pytest.mark.long
 def test_what_drafts_share_is_computed_before_the_first_move(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(relit_preview, "TARGET_BUDGET", 60)
     monkeypatch.setattr(relit_preview, "OBJECT_BUDGET", 30)

@@ -117,6 +117,7 @@ def divided(before: torch.Tensor, after: torch.Tensor, column: int | None = None
     return torch.cat([before[:, :at], after[:, at:]], 1)
 
 
+@pytest.mark.long
 def test_the_page_works_in_the_frame_of_a_notebook(browser, page_file, tmp_path):
     (tmp_path / "notebook.html").write_text(frame_of(page_file, height=SIZE[1]), "utf-8")
     context = browser.new_context(offline=True)

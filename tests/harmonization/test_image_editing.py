@@ -71,6 +71,7 @@ def test_what_is_no_editing_pipeline_is_one_line(folder, tmp_path):
         make_harmonizer("edit")
 
 
+@pytest.mark.long
 def test_one_photo_is_harmonised_by_its_mask(folder, tmp_path, capsys):
     shown = view(37, 50)
     mask = tmp_path / "mask.png"

@@ -185,6 +185,7 @@ def whole(tmp_path_factory):
     return command
 
 
+@pytest.mark.long
 def test_our_methods_run_on_a_composite_that_is_already_placed(whole):
     rows, found = by_scene_and_method(whole)
     assert found["missing"] == []

@@ -280,6 +280,7 @@ def test_object_removal_learns_its_pair(tmp_path):
     assert error(removal_run(tmp_path, "out", base, loop).train()) < 0.7 * error(base)
 
 
+@pytest.mark.long
 def test_object_removal_is_trained_by_the_same_loop_and_resumes(tmp_path):
     base = removal_folder(tmp_path / "base")
     loop = replace(QUICK, steps=3, batch=1, save_every=2, validate_every=99, validation_pairs=1)

@@ -122,6 +122,7 @@ def before_walls(capture, tmp_path) -> PosedImages:
     return replace(capture, image_paths=paths)
 
 
+@pytest.mark.long
 def test_walls_behind_the_points_are_shown_to_held_out_views_and_dark_ones_have_no_holes(before_walls, monkeypatch):
     options = ReconstructOptions(iterations=200, budget=1500, sh_degree=0, eval_every=8)
     found = reconstruct(before_walls, options)

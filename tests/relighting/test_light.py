@@ -312,7 +312,7 @@ def main_direction(light):
     return normals[light.irradiance(normals).sum(1).argmax()]
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 2.1])
+@pytest.mark.parametrize("azimuth", [0.0, pytest.param(2.1, marks=pytest.mark.long)])
 def test_shadows_give_the_direction_of_a_sun_that_no_camera_saw(azimuth):
     sun = torch.nn.functional.normalize(torch.tensor([0.78 * math.cos(azimuth), 0.78 * math.sin(azimuth), 0.8]), dim=0)
     light = estimated(sunlit_scene(sun, strength=3.0))
@@ -374,8 +374,12 @@ def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s
 
 
 # 15 degrees are the standard error that clicks are taken to have
-@pytest.mark.parametrize("off_deg", [5.0, 10.0, 15.0])
-@pytest.mark.parametrize("around", [0, 3, pytest.param(slice(None), marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "off_deg", [pytest.param(5.0, marks=pytest.mark.long), 10.0, pytest.param(15.0, marks=pytest.mark.long)]
+)
+@pytest.mark.parametrize(
+    "around", [0, pytest.param(3, marks=pytest.mark.long), pytest.param(slice(None), marks=pytest.mark.long)]
+)
 def test_points_that_are_degrees_off_give_the_sun_of_the_shadow_beside_them(off_deg, around):
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     captured, top = CapturedScene(sunlit_scene(sun, 3.0), views()), torch.tensor([1.0, 0.2, 0.5])
@@ -397,6 +401,7 @@ def clock_at(*directions, error_deg=5.0):
     return ClockSun(tuple(candidates), (0.0, 0.0, 1.0), error_deg, "a compass", None)
 
 
+@pytest.mark.long
 def test_a_clock_decides_between_shadows_and_does_not_overrule_clear_ones():
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     scene, region = sunlit_scene(sun, 3.0), BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 2.4)
@@ -419,6 +424,7 @@ def test_a_clock_decides_between_shadows_and_does_not_overrule_clear_ones():
     assert degrees_apart(by_clock.direction, near) < degrees_apart(alone.direction, near)
 
 
+@pytest.mark.long
 def test_beside_a_clock_that_agrees_fainter_shadows_show_the_sun():
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     noise = torch.randn(20000, generator=torch.Generator().manual_seed(3))
@@ -435,7 +441,7 @@ def test_beside_a_clock_that_agrees_fainter_shadows_show_the_sun():
     assert 10 < by_clock.evidence < 40
 
 
-@pytest.mark.parametrize("place", [(1.5, -1.5, 0.05), (-1.8, -1.6, 0.05)])
+@pytest.mark.parametrize("place", [(1.5, -1.5, 0.05), pytest.param((-1.8, -1.6, 0.05), marks=pytest.mark.long)])
 def test_shadows_far_from_a_small_object_show_the_sun(place):
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     small = BoundingSphere(torch.tensor(place), 0.06)
@@ -474,6 +480,7 @@ def test_shading_and_highlights_show_how_strong_the_sun_of_the_clock_is():
     assert hidden is None or float(hidden.ratio @ LUMINANCE) < 0.3 * float(bright.ratio @ LUMINANCE)
 
 
+@pytest.mark.long
 def test_shadows_show_the_sun_on_a_floor_of_two_materials():
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     checked = painted(sunlit_scene(sun, 3.0), lambda at: 0.5 + 0.5 * ((at[:, :2] * 1.2).floor().sum(1) % 2))
@@ -482,11 +489,18 @@ def test_shadows_show_the_sun_on_a_floor_of_two_materials():
     assert degrees_apart(found.direction, sun) < 3
 
 
-@pytest.mark.parametrize("gray", [lambda at: 1.0 + 0 * at[:, 0], lambda at: 0.3 + 0.7 * ((at[:, 0] * 1.5).floor() % 2)])
+@pytest.mark.parametrize(
+    "gray",
+    [
+        pytest.param(lambda at: 1.0 + 0 * at[:, 0], marks=pytest.mark.long),
+        lambda at: 0.3 + 0.7 * ((at[:, 0] * 1.5).floor() % 2),
+    ],
+)
 def test_neither_even_light_nor_stripes_make_a_sun(gray):
     assert sun_of(painted(sunlit_scene(UP, 0.0), gray)) is None
 
 
+@pytest.mark.long
 def test_bars_of_sunlight_beside_what_nothing_explains_do_not_turn_the_sun():
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     # a window's frame that no camera saw shades a third of the floor
@@ -510,7 +524,7 @@ def windowed_room(window, radius_deg, white=1.0):
     return concatenate([surfels(20 * shell, -shell, width=0.6, srgb=rgb), sunlit_scene(window, strength=3.0)])
 
 
-@pytest.mark.parametrize(("radius_deg", "white"), [(10, 0.99), (14, 1.0)])
+@pytest.mark.parametrize(("radius_deg", "white"), [pytest.param(10, 0.99, marks=pytest.mark.long), (14, 1.0)])
 def test_a_clipped_window_is_a_source_where_it_was_photographed(radius_deg, white):
     window = torch.nn.functional.normalize(torch.tensor([0.8, 0.3, 0.15]), dim=0)
     main = estimated(windowed_room(window, radius_deg, white), views((0.0, 1.5))).sources[0]
@@ -532,7 +546,9 @@ def test_what_no_camera_saw_is_white_whatever_the_colour_of_what_stands_around()
     assert max(r, g, b) < 1.1 * min(r, g, b)
 
 
-@pytest.mark.parametrize(("height", "name"), [(0.15, "sun or window"), (0.6, "sun or lamp")])
+@pytest.mark.parametrize(
+    ("height", "name"), [pytest.param(0.15, "sun or window", marks=pytest.mark.long), (0.6, "sun or lamp")]
+)
 def test_what_shadows_alone_show_is_named_by_where_it_may_be(height, name):
     sun = torch.nn.functional.normalize(torch.tensor([0.3, 0.3, height]), dim=0)
     light = estimated(sunlit_scene(sun, strength=3.0), views((0.0, 1.5)))
@@ -551,7 +567,7 @@ def test_a_direction_is_called_uncertain_from_15_degrees_on(uncertainty_deg, is_
     assert light_confidence(light) == pytest.approx(expected, rel=1e-6)
 
 
-@pytest.mark.parametrize("strength", [0.0, 1.0])
+@pytest.mark.parametrize("strength", [pytest.param(0.0, marks=pytest.mark.long), 1.0])
 def test_a_white_floor_is_no_source(strength):
     bright = painted(sunlit_scene(UP, strength), lambda at: torch.where(at[:, 0] > 1, 8.0, 0.3))
     place = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.1)
@@ -571,6 +587,7 @@ def test_without_surfaces_to_compare_the_light_is_what_was_photographed():
     assert torch.allclose(light.irradiance(normals), torch.full((50, 3), 0.214 * math.pi), rtol=0.25)
 
 
+@pytest.mark.long
 def test_the_estimate_does_not_depend_on_the_world_axes():
     sun = torch.nn.functional.normalize(torch.tensor([0.6, -0.5, 0.8]), dim=0)
     scene = sunlit_scene(sun, strength=3.0)

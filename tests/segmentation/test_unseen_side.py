@@ -81,6 +81,7 @@ def test_the_back_of_what_was_photographed_from_one_side_is_opaque_and_has_its_c
     assert errors(closed.gaussians, whole, cameras) > 37
 
 
+@pytest.mark.long
 def test_the_back_of_what_has_two_hues_is_not_grey() -> None:
     plain, cameras = egg(90), ring(0, 180)
     is_red = (plain.means[:, :1] * 12).floor() % 2 == 0
@@ -102,6 +103,7 @@ def test_what_was_photographed_from_all_sides_stays_as_it_is() -> None:
     assert closed.guessed_share == 0
 
 
+@pytest.mark.long
 def test_nothing_floats_where_only_a_few_photographs_reach() -> None:
     # three from above; the others' frames end below what stands between those and the object
     above = CENTER + torch.tensor([[0.1, 0.0, 2.5], [0.0, 0.1, 2.6], [-0.1, 0.0, 2.4]])
