@@ -1,7 +1,7 @@
 """`paper reproduce` at toy size: real classes of diffusers, transformers and onnxruntime with tiny weights.
 
-python toy_reproduce.py FOLDER STAGE STAGE .. runs it in FOLDER/killed once per stage, in a process that ends itself by
-SIGKILL at the stage's first progress, then once without.
+python toy_reproduce.py FOLDER [STAGE] runs it in FOLDER/killed; the process ends itself by SIGKILL at the stage's first
+progress.
 """
 
 import json
@@ -81,11 +81,8 @@ def write_inputs(root):
     return [*words, "--each", "1", "--relighter", "stand-in"]
 
 
-def killed_in(stage, arguments):
-    """Run the command in a child process that kills itself in a stage."""
-    if child := os.fork():
-        _, status = os.waitpid(child, 0)
-        return status
+def end_in(stage):
+    """Let this process kill itself in a stage of the command."""
     running, plain, move = [None], reproduce.Reproduce._run, console._Lines.__call__
 
     def run(self, name, words):
@@ -101,12 +98,11 @@ def killed_in(stage, arguments):
             os.kill(os.getpid(), signal.SIGKILL)
 
     reproduce.Reproduce._run, console._Lines.__call__ = run, progress
-    torch.set_num_threads(1)  # in the child alone, because torch's pool of threads does not outlive a fork
-    os._exit(main(arguments))
 
 
 if __name__ == "__main__":
     root, *stages = sys.argv[1:]
-    arguments = json.loads((Path(root) / "arguments.json").read_text())
-    statuses = [killed_in(stage, ["paper", "reproduce", f"{root}/killed", *arguments]) for stage in [*stages, None]]
-    (Path(root) / "statuses.json").write_text(json.dumps(statuses))
+    torch.set_num_threads(1)
+    for stage in stages:
+        end_in(stage)
+    sys.exit(main(["paper", "reproduce", f"{root}/killed", *json.loads((Path(root) / "arguments.json").read_text())]))
