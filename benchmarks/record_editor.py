@@ -72,9 +72,13 @@ class Recorder:
             self.page.wait_for_timeout(250)
         self.shoot()
 
+    def _changes(self) -> list[int]:
+        shots = [shot for _, shot in self._pictures]
+        return [i for i in range(len(shots)) if i == 0 or shots[i] != shots[i - 1]]
+
     def write(self, file: Path) -> None:
         """Write an animated WebP; equal neighbours are one picture."""
-        times, shots = zip(*self._pictures, strict=True)
+        times, shots = zip(*(self._pictures[i] for i in self._changes()), strict=True)
         images = [Image.open(io.BytesIO(shot)).convert("RGB") for shot in shots]
         images = [
             image.resize((WIDTH, WIDTH * image.height // image.width), Image.Resampling.LANCZOS) for image in images

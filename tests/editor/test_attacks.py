@@ -136,6 +136,7 @@ def test_attacks_of_all_kinds_leave_a_page_that_works(tmp_path: Path) -> None:
         assert process.wait(HANG_LIMIT) == 0
     finally:
         process.kill()
+        process.communicate()  # closes the pipe
     assert not stray(log.read_text())
 
 
@@ -159,7 +160,8 @@ def too_much(client: Client, folder: Path) -> None:
     with client.window() as window:
         with contextlib.suppress(ConnectionClosed):  # before all is sent
             window.socket.send("a" * 100_000_000)
-        assert window.closed_with()[0] == 1009
+        # 1009 is lost where the connection ends before the client has sent all
+        assert window.closed_with()[0] in (1006, 1009)
     with client.window() as window:
         for message in malformed():
             window.socket.send(message)

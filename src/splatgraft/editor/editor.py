@@ -49,6 +49,7 @@ KINDS: dict[str, Kind] = {
 """Kinds of pictures of the target, by the label in the menu."""
 _POLL_SECONDS = 0.4
 _MARK_SECONDS = 1.0  # time without a change before the steps' marks are updated
+_PAUSE_SECONDS = 0.2  # time without a move in a drag before the light of its place is requested
 _DRAWN_SECONDS = 0.3  # longest wait of a drag's next move for the picture of the last one
 _CURRENT, _DONE, _STALE, _NEXT = "●", "✓", "↻", "›"
 _WORDS = {"do": "id", "live": "id", "key": "key", "step": "to"}
@@ -157,7 +158,9 @@ class Editor:
     def show_live(self, state: EditState | None) -> None:
         """Show a state during a drag; None shows the saved one."""
         self.live = state
-        self._want_light()
+        # a dragged object keeps its last colours until it pauses; a dragged light shows by its drafts alone
+        if state is None or self.step == "Light":
+            self._want_light()
         self.stream.touch(moving=True)
 
     def run(self, to: str, title: str) -> None:
@@ -344,8 +347,7 @@ class Editor:
         if stage == "final":
             return
         if self.live is not None:
-            if self._moves is None:  # the pointer rests
-                self._light.want(state, "draft")
+            self._light.want(state, "draft")
         else:
             self._light.want(state, "prepared" if stage == "file" and self.step != "Light" else "final")
 
@@ -396,6 +398,8 @@ class Editor:
             raise ValueError("expected a name")
         if view is self.editing():
             if kind == "pointer" and message["what"] == "move":
+                if self.live is not None:
+                    view.moved_at = time.monotonic()  # no picture of full size between two slow moves
                 waits, self._moves = self._moves is not None, message
                 if waits:
                     return
@@ -450,7 +454,15 @@ class Editor:
     # actions of the editing window, in a thread of their own
 
     def _act(self) -> None:
-        while (action := self._actions.get()) is not None:
+        while True:
+            try:
+                action = self._actions.get(timeout=_PAUSE_SECONDS if self.live is not None else None)
+            except queue.Empty:
+                with self.lock, self.reported():
+                    self._want_light()  # of the place where the drag pauses
+                action = self._actions.get()
+            if action is None:
+                return
             window, message = action
             is_move = message["t"] == "pointer" and message["what"] == "move"
             if is_move:

@@ -33,9 +33,9 @@ _START = "import sys; from splatgraft.editor import light_process; light_process
 """Code that the process runs; `python -m` would pickle classes of `__main__`, which the editor cannot load."""
 _FIELDS = ("objects", "erased", "light")
 """Fields of `EditState` on which the light depends."""
-_SETTLE_SECONDS = 0.25  # time without a change before the light, or a draft during a drag, starts
+_SETTLE_SECONDS = 0.2  # time without a request before the light starts, which cannot be interrupted
 _REMEMBERED = 500  # stored requests; each picture of a drag makes one, and a draft may take long
-_NICE = 5  # priority below that of pictures
+_NICE = 10  # priority below that of pictures
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,8 @@ class LightProcess:
         self._sent, self._asked = {}, {}
         out = "" if self._project.out is None else str(self._project.out)
         words = [sys.executable, "-c", _START, str(self._project.file), out]
-        self._child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+        # a group of its own is not interrupted by Ctrl-C; in another session its priority would not count (autogroups)
+        self._child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0)
         threading.Thread(target=self._listen, args=(self._child,), name="splatgraft light", daemon=True).start()
 
     def _listen(self, child: subprocess.Popen[bytes]) -> None:
@@ -155,11 +156,9 @@ class _Computing:
 
     def _draft(self, asked: tuple[int, EditState, Wanted]) -> None:
         number, state, wanted = asked
-        # the layers of an outdated placement would delay the pictures and the next draft
-        if wanted != "final" and not self._drafts.wait_idle(_SETTLE_SECONDS):
-            return
         if wanted == "prepared":
-            self._relighting.prepare_drafts(state)
+            if self._drafts.wait_idle(_SETTLE_SECONDS):
+                self._relighting.prepare_drafts(state)
             return
         start = time.monotonic()
         if self._scenes.files.transfers_light and not self._relighting.is_relit(state):

@@ -288,6 +288,9 @@ class _Guard:
             headers["Upgrade"] = "websocket"
         path = f"{scope['path']}?{scope['query_string'].decode('latin-1')}"
         refused = why_refused(self._token, headers, path)
+        if refused is not None and scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008, "reason": refused})  # the client receives status 403
+            return
         if refused is not None:
             await _refusal(refused, 403)(scope, receive, send)
             return
