@@ -52,8 +52,8 @@ def descend_as_paper(
 ) -> Gaussians:
     """Fit colours to harmonised images by the paper's gradient descent; geometry and opacity stay.
 
-    The inputs are those of `splatgraft.consolidate`. Memory above the inputs, for n Gaussians with k coefficients, is
-    4 n 24 k bytes, 3 GiB for cached views, the tile lists of two views and a few images.
+    The inputs are those of `splatgraft.consolidate`. For n Gaussians with k coefficients, memory above the inputs is
+    4 n 24 k bytes, the tile lists of two views and a few images. Cached views add up to 3 GiB.
 
     Raises:
         ValueError: There is no camera or not one image per camera, or an image has another size than its camera or

@@ -1,8 +1,8 @@
 """The sun's direction in a capture's world, from the time, the place and the compass of its photos.
 
-Time and place give the sun's height and azimuth. The rotation from east, north and up to the world is that of the
-similarity that fits the camera centres to the GPS positions (Umeyama 1991), reweighted for outliers. If the track is
-too short or too straight, it is fitted together with the cameras' up direction and the compass (Wahba's problem).
+Time and place give the sun's height and azimuth. A similarity fitted to camera centres and GPS positions (Umeyama
+1991), reweighted for outliers, gives the rotation from east, north and up to the world. If the track is too short or
+too straight, it is fitted together with the cameras' up direction and the compass (Wahba's problem).
 """
 
 import math
@@ -30,7 +30,7 @@ _TROPIC_DEG = 23.4  # countries between the tropics have no daylight saving time
 _MAX_SPREAD_H = 1.0  # standard deviation of the photos' times; the sun moves by up to 15 degrees in this time
 
 # standard errors of the orientation, set by hand
-_GPS_M = 3.0  # smallest error of a GPS position: neighbours share most of it, so residuals may not show it
+_GPS_M = 3.0  # smallest error of a GPS position; residuals may be smaller, because neighbours' errors correlate
 _INDEPENDENT = 4  # number of readings that count as independent, because GPS and compass drift slowly
 _LEVEL_RAD = math.radians(5)  # level of cameras about either axis; those of a drone without gimbal were 7 off in all
 _PITCH_RAD = math.radians(20)  # up direction about the cameras' horizontal axes if these are parallel

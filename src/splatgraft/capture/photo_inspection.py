@@ -3,7 +3,7 @@
 - Sharpness is that of `usable_views.log_sharpness`.
 - Overlap is the number of SIFT matches (Lowe 2004: ratio test) that satisfy the epipolar geometry (USAC, MAGSAC++).
   Photos are matched with those that follow in the order of names. Photos that these matches leave unconnected are
-  matched with the photos that share most of their largest features.
+  matched with the photos whose largest features match best.
 - Exposure is compared between neighbours at their matches, because a surface should have the same brightness in both.
 """
 

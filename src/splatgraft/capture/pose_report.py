@@ -1,7 +1,7 @@
 """Report of structure from motion: its figures, the implausible ones among them, and their file.
 
-A wrong model often poses all photos with a small reprojection error, because COLMAP drops what does not fit. The
-explained share of verified matches has no such weakness, because it counts what was dropped.
+A wrong model often poses all photos with a small reprojection error, because COLMAP drops matches that do not fit.
+The explained share of verified matches also counts the dropped ones, so it is low for such a model.
 """
 
 from collections.abc import Sequence

@@ -172,9 +172,9 @@ def estimate_scene_up(
 ) -> tuple[Float[Tensor, "3"], str, bool]:
     """Estimate the up direction of a scene: the normal of the largest plane in the dense part.
 
-    Up points to the side with more points. The conventions of files decide the sign in two cases: if the normal is
-    nearly z (+z, because there may be as much below a table as on it), and if both sides have similarly many points
-    (+z, or -y as in structure from motion).
+    Up points to the side with more points. In two cases, file conventions give the sign. If the normal is nearly z, up
+    is +z, because a table may have as many points below as on it. If both sides have similar numbers of points, up is
+    +z or, as in structure from motion, -y.
 
     Returns:
         Unit up direction, its reason for messages, and whether the scene itself decided the sign.

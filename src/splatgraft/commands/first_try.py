@@ -135,10 +135,10 @@ def refinements(flow: Flow, folder: Path) -> list[str]:
 
 
 def _rank(step: Step, note: Note) -> tuple[int, bool]:
-    """Rank a doubt by what it costs in the picture, the worst first.
+    """Rank a doubt by its effect on the picture, the worst first.
 
-    Wrong poses spoil all. Then come the object and its light, which the picture shows first, and its place. A guess
-    without a remedy comes after the step's measured faults.
+    The order is wrong poses, the object, its light, its placement, other steps. A guess without a remedy comes after
+    the step's measured faults.
     """
     if isinstance(step, Capture):
         of_poses = any(str(doubt) in note.text for doubt in read_doubts(step.out))

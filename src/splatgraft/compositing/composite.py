@@ -54,7 +54,7 @@ class Composite:
     def merged(self) -> tuple[Gaussians, Bool[Tensor, "m"]]:
         """Join the target's kept Gaussians and the objects', none split; returns them and a mask of the objects'.
 
-        The support of an object is flattened around its foot, so that it does not cover the foot.
+        The support of an object is flattened around its foot, so that the foot stays visible.
         """
         kept = self.target.select(~self.erased) if bool(self.erased.any()) else self.target
         # an empty object is left out, because it could raise the degree of the harmonics

@@ -1,4 +1,4 @@
-"""Contact: flatten the layer of Gaussians that an object stands on, so that it does not cover the object's foot.
+"""Contact: flatten the layer of Gaussians that an object stands on, so that the object's foot stays visible.
 
 A reconstructed floor or table is a layer of Gaussians as thick as its noise. The upper ones are blended in front of an
 object that stands on it. For each object:

@@ -112,7 +112,7 @@ def measure_ground(
 
 
 def draw_ground(target: Gaussians, ground: Ground, *, cameras: Cameras) -> Float[Tensor, "h w 3"]:
-    """Draw the view of the camera that shows most of the support; level places are green, things on it red."""
+    """Draw the camera view with the most visible support; level places are green, things on it red."""
     surface, views = ground.surface, cameras.spread(VIEWS)
     points, slack = surface.points[ground.support], 3 * surface.pixel
     shown = [int(visible_points(target, points, camera=c, slack=slack).sum()) for c in small_cameras(views)]

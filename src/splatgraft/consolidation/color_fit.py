@@ -1,6 +1,6 @@
 """Consolidation: fits the SH colours of a composite to independently harmonised views; geometry and opacity stay.
 
-The paper (section Multi-View Consolidation) descends on LPIPS; here least squares do most of the work:
+The paper (section Multi-View Consolidation) descends on LPIPS. Here, a short descent refines a least-squares fit:
 
 1. Find the pixels that the harmoniser changed and the Gaussians on them; the others stay.
 2. Solve normal equations for the colours, with each view's tint and flow (`normal_equations`, `view_errors`).
@@ -60,8 +60,8 @@ def consolidate(
     their colours exactly. Equal inputs and seeds give equal results.
 
     For n Gaussians with k coefficients, the memory above the inputs is 4 n (k^2 + 50 k) bytes, the tile lists of two
-    views, a few images, and up to `options.cache_bytes` for views and their corrected images. It does not grow further
-    with the number of views.
+    views and a few images. Views and their corrected images add up to `options.cache_bytes`. The memory does not grow
+    further with the number of views.
 
     Args:
         composite: The scene of which the images were made.

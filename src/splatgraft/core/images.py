@@ -133,7 +133,7 @@ def _is_sideways(image: Image.Image, size: tuple[int, int]) -> bool:
 
 
 def _exif_orientation(image: Image.Image) -> int:
-    """Return the EXIF orientation, 1 to 8; 1, upright, if there is none."""
+    """Return the EXIF orientation, 1 to 8; 1 (upright) if it is missing."""
     try:
         return image.getexif().get(Base.Orientation, 1)
     except Exception:  # as in read_exif

@@ -127,7 +127,7 @@ def _heights(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3"]:
 def _insets(
     points: Float[np.ndarray, "n 3"], facing: Float[np.ndarray, "n 3"], largest: float
 ) -> Float[np.ndarray, "n"]:
-    """Compute how far points may move inwards: at most to 0.4 of the thickness where the part is thin."""
+    """Compute the largest inward shift of each point: `largest`, or 0.4 of the thickness of a thin part."""
     out = np.full(len(points), largest)
     pairs = KDTree(points).query_pairs(2.5 * largest, output_type="ndarray")
     pairs = pairs[np.einsum("pi,pi->p", facing[pairs[:, 0]], facing[pairs[:, 1]]) < -_SAME_SIDE]

@@ -18,7 +18,7 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.runtime.lazy_sequence import LazySequence
 
 SHADOW_RATIO = 0.95
-"""Ratio of linear light with the object to linear light without it, below which a pixel counts as shadowed."""
+"""Ratio of linear light with the object to that without the object, below which a pixel counts as shadowed."""
 
 # set by hand
 _CHANGED = 2 / 255  # sRGB difference with and without the object above which a pixel counts as changed

@@ -121,7 +121,7 @@ def _still(scenes: list[Gaussians], view: FirstView, background: float) -> bytes
 
 
 def write_report_file(path: Path, report: Path) -> None:
-    """Write the report of `evaluate`, an index.html with its pictures, as one file; ValueError if one is missing."""
+    """Write the report of `evaluate` (index.html and its pictures) to one file; ValueError if a file is missing."""
     if not report.is_file():
         raise ValueError(f"{report}: expected the report of a project, found none; `splatgraft run` writes it")
     text = report.read_text(encoding="utf-8")

@@ -1,8 +1,8 @@
 """The shadow of a transfer as black Gaussians, to be drawn over another picture of the place.
 
 Over-compositing black with opacity a multiplies the picture behind it by 1 - a. So the Gaussians of the place on which
-the shadow falls are coloured black, and their opacities are fitted to the shadow in the target's cameras (least
-squares, Adam). Light that the object adds to the place is left out.
+the shadow falls are coloured black. Their opacities are fitted to the shadow in the target's cameras (least squares,
+Adam). Light that the object adds to the place is left out.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Distance between the windowed Fourier magnitudes of two images, with its gradient, as numba kernels.
 
-A window of 16x16 pixels is transformed by two products with the matrix of the discrete Fourier transform, in rows of 16
-numbers that fit into the first-level cache. Spectra of real windows are symmetric, so rows 0 to 8 are enough.
+A window of 16x16 pixels is multiplied twice by the matrix of the discrete Fourier transform. Its rows of 16 numbers fit
+into the first-level cache. Spectra of real windows are symmetric, so rows 0 to 8 are enough.
 """
 
 import math

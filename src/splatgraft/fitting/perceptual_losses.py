@@ -38,9 +38,9 @@ def l1(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[T
 def windowed_fourier(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
     """Compute L1 between the Fourier magnitudes of overlapping Hann windows, plus a tenth of L1 between the pixels.
 
-    Windows have 16 pixels and overlap by half. Magnitudes do not depend on the position of an edge in the window, so
-    views that disagree by a pixel favour one sharp edge over the average of two. Their scale is such that independent
-    noise has the same standard deviation in magnitudes and pixels.
+    Windows have 16 pixels and overlap by half. Magnitudes do not depend on the position of an edge in the window. So
+    one sharp edge has a smaller loss than the average of two if views disagree by a pixel. Magnitudes are scaled so
+    that independent noise has the same standard deviation in magnitudes and pixels.
     """
     window = _hann(image.dtype, image.device)
     planes, wanted_planes = _padded(image), _padded(target.detach())

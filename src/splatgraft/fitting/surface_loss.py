@@ -1,9 +1,9 @@
-"""Loss on inverse depth that holds plain surfaces, beside the photometric loss of a fit.
+"""Loss on inverse depth that keeps plain surfaces flat, beside the photometric loss of a fit.
 
-Photographs alone leave the depth of a plain surface open: at any depth it gives the same pictures. Inverse depth is
-linear in the pixel on a plane. So the loss is the second difference of the mean inverse depth of rays over plain parts
-of a photograph, and a bare table is held by its textured rim. It is the planar prior of ACMP (Xu and Tao 2020) as a
-loss.
+Photographs alone do not determine the depth of a plain surface, because it looks the same at any depth. On a plane,
+inverse depth is linear in the pixel. So the loss is the second difference of the rays' mean inverse depth over plain
+parts of a photograph. A bare table gets its depth from its textured rim. This is the planar prior of ACMP (Xu and Tao
+2020) as a loss.
 """
 
 from dataclasses import dataclass

@@ -22,9 +22,9 @@ class InputDescription:
     """The recognised kind of a path, with a line for the user."""
 
     kind: InputKind
-    """Kind of the input; `nothing` if it is none of the others."""
+    """Kind of the input; `nothing` if no other kind fits."""
     text: str
-    """Line for the user: what the input is and how it can be used."""
+    """Line for the user: the content of the input and its use."""
 
     @property
     def is_usable(self) -> bool:

@@ -2,8 +2,8 @@
 
     {"metres_per_unit": 0.21, "source": "a length of 0.3 m between two points"}
 
-It lies in the capture's folder. If a step made the capture, it lies beside the folder, so that a new run keeps it; the
-step may write one into the folder, from a file that states its size, which counts if there is none beside it.
+It lies in the capture's folder. If a step made the capture, it lies beside the folder, so that a new run keeps it. The
+step may write another one into the folder, from a file that states its size. This one is read if the first is missing.
 """
 
 from dataclasses import asdict, dataclass

@@ -97,7 +97,7 @@ class Record:
 
 
 def read_record(folder: Path) -> Record | None:
-    """Read the record of a finished result, None if there is none; raises ValueError if step.json is damaged."""
+    """Read the record of a finished result, None if missing; raises ValueError if step.json is damaged."""
     path = folder / STEP_FILE
     if not path.is_file():
         return None

@@ -101,7 +101,7 @@ def random_seeds(cameras: Cameras, *, count: int, seed: int) -> SeedPoints:
     """Draw points of random colours, uniformly in the volume that most cameras see.
 
     Candidates lie in a sphere around the point nearest to all optical axes, with the cameras' mean distance as radius.
-    A candidate is kept if it is seen by more than half as many cameras as the candidate seen by most.
+    A candidate is kept if the number of cameras that see it is more than half of the largest such number.
 
     Args:
         cameras: Cameras of the capture.

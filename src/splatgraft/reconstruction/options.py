@@ -117,8 +117,8 @@ class ReconstructOptions:
     def sampling(self, served: Cameras) -> tuple[Sampling, ...]:
         """Return the schedule of the fitted pixels for the served views.
 
-        Pixels are skipped only if a step still has at least as many pixels as there are Gaussians. On a room at 352x248
-        with 25k Gaussians, which has fewer, fitting every second pixel costs half a decibel.
+        Pixels are skipped only if a step still has at least one pixel per Gaussian. On a room at 352x248 with 25k
+        Gaussians, which has fewer, fitting every second pixel costs half a decibel.
         """
         sampling = _PRESETS[self.quality].sampling
         sizes = served.sizes.prod(1).double()

@@ -5,8 +5,8 @@ Each view has a grid of cells. A cell without a sparse point gets a ray:
 1. Along the ray, the depth is chosen at which a patch parallel to the image agrees best with the nearest views (Collins
    1996). The cost of a patch is the mean absolute difference of its pixels. The mean over the better half of the views
    allows for occlusion (Kang et al. 2001).
-2. Plain surfaces agree at many depths. The depth between the sparse points around the cell, linear over their Delaunay
-   triangles, is taken unless another one agrees clearly better (planar prior of ACMP, Xu and Tao 2020).
+2. Plain surfaces agree at many depths. So inverse depth is interpolated over the Delaunay triangles of the sparse
+   points (planar prior of ACMP, Xu and Tao 2020). This depth is taken unless another one agrees clearly better.
 3. A point stays if two of the compared views have a point of the same depth there.
 """
 

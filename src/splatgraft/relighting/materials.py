@@ -138,7 +138,7 @@ def known_materials(surface: KnownSurface) -> Materials:
     """Represent metallic-roughness materials by lobes; sharper reflections than the sharpest lobe are blurred.
 
     The concentration of a GGX lobe around the mirrored direction is 1 / (2 alpha^2) (Wang et al. 2009). A rough
-    dielectric reflects less towards grazing views (Lagarde 2011). What it does not reflect on average is matt.
+    dielectric reflects less towards grazing views (Lagarde 2011). The matt part has factor 1 - mean reflectance.
     """
     albedo = linear_from_srgb(spherical_harmonics.rgb_from_dc(surface.sh[:, 0]).clamp(0, 1))
     metal = surface.metallic[:, None]

@@ -1,7 +1,8 @@
 """Views with frozen geometry: numba kernels that find the rows of a splat with weight, and apply W^T W in one pass.
 
-Behind an opaque surface a splat's weights are almost 0 in most of its rows; the others are found once. W^T W is applied
-tile by tile: a tile's list draws all of its pixels, so that no whole image is needed and each weight is computed once.
+Behind an opaque surface, most rows of a splat have weights of almost 0; the others are found once. W^T W is applied
+tile by tile, because a tile's list draws all of its pixels. So no whole image is needed, and each weight is computed
+once.
 """
 
 from typing import no_type_check

@@ -239,7 +239,7 @@ def project_backward(
 
     `totals (n, ..)` begins with sums over pixels of dL/d(exponent) times 1, dx, dy, dx^2, dx dy, dy^2, where d goes
     from the centre to the pixel. The gradients of the three columns of inverse depth begin at column `depth_at`, those
-    of the normal at `normal_at`; 0 means that there are none.
+    of the normal at `normal_at`; 0 means that they are missing.
     """
     n, low = means.shape[0], camera[LOW_PASS]
     for block in prange((n + BLOCK - 1) // BLOCK):

@@ -31,7 +31,7 @@ GrabCut's time grows with the area."""
 
 @dataclass(frozen=True)
 class CutRequest:
-    """The 2D algorithm, and what the user says about the object."""
+    """The 2D algorithm, and the user's box and prompts."""
 
     cutter: ViewCutter
     """Algorithm for one image."""

@@ -1,8 +1,8 @@
 """Fit of an extracted object, alone, to its masked photographs over random backgrounds.
 
-In its own capture, an object that is half transparent or larger than its outline can look right in front of the scene
-that was fitted with it. Only an opaque object inside its mask matches the photographs over every background. All pixels
-and Gaussians of this fit belong to the object, so a draft of the capture is enough (docs/results.md).
+An object that is half transparent or larger than its outline can look right in front of its own surroundings, because
+both were fitted together. Only an opaque object inside its mask matches the photographs over every background. All
+pixels and Gaussians of this fit belong to the object, so a draft of the capture is enough (docs/results.md).
 
 1. Each view is cropped to the object. Pixels in which something else hides the object are not compared.
 2. The object is fitted. If it has few Gaussians for its size in the photographs, Gaussians are split as in a
@@ -92,7 +92,7 @@ def solidify_object(
     options: SolidifyOptions = SolidifyOptions(),
     progress: Progress = silent,
 ) -> Gaussians:
-    """Fit an extracted object alone to its masked images over random backgrounds, so that it becomes opaque and fine.
+    """Fit an extracted object alone to its masked images over random backgrounds, to make it opaque and detailed.
 
     Pixels outside the mask in which something in front hides the object are not compared.
 

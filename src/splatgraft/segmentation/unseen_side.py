@@ -177,7 +177,7 @@ def _inside_masks(
         column, row = pixels.nan_to_num(0).clamp(-1, 1e6).long().unbind(1)
         inside[left] += framed & (mask[row.clamp(0, height - 1), column.clamp(0, width - 1)] > 0.5)
         shown[left] += framed
-        # drop points outside more masks than may be wrong, which soon are most of the grid
+        # drop points outside more masks than may be wrong; soon, few points are left
         left = left[shown[left] - inside[left] <= (1 - _AGREEING) * len(cameras)]
     return (shown >= _SHOWN * len(cameras)) & (inside >= _AGREEING * shown)
 

@@ -131,7 +131,7 @@ class Segment:
         return plain_options(vars(self)) | {"mask_source": self._source(read_capture(self.capture))}
 
     def write(self, folder: Path, context: Context) -> None:
-        """Write the object and the scene without it."""
+        """Write the object and its surroundings."""
         device = choose_device(self.device, context.console)
         scene = read_gaussians(self.scene)
         on_device = scene.to(device)

@@ -40,7 +40,7 @@ class Flow:
         return found
 
     def up_to(self, name: str | None) -> dict[str, Step]:
-        """Return the steps that `name` depends on, and itself last; all steps if it is None."""
+        """Return the steps that `name` depends on, then `name`; all steps if `name` is None."""
         wanted = set(self.steps) if name is None else self.named(name)
         for other in reversed(list(self.steps)):
             wanted |= set(self.before(other)) if other in wanted else set()

@@ -1,4 +1,4 @@
-"""The whole transfer as one call in Python: a project is written and run, and its result read as a value."""
+"""The whole transfer in a single Python call, which writes and runs a project and returns its result."""
 
 import json
 import sys
@@ -97,7 +97,7 @@ def transfer(
 
 
 def _path_of(given: Given, folder: Path) -> Path:
-    """Return a path as it is; write a value below `folder`, as a capture or a scene."""
+    """Return a given path, or write a value to `folder` (.ply for a scene) and return that."""
     if isinstance(given, Gaussians):
         path = folder.with_suffix(".ply")
         write_gaussians(path, given.to("cpu"))
@@ -115,7 +115,7 @@ class Transfer:
     """The result of `transfer`, with the values to move or light the object again."""
 
     project: Path
-    """Folder of all results; `splatgraft edit` and `splatgraft run` continue with it."""
+    """Folder of all results; `splatgraft edit` and `splatgraft run` accept it."""
     result: ExportSource
     """The relit scene and the scenes before it."""
     composite: Composite

@@ -80,7 +80,7 @@ class ComposedScene:
     light: Path | None = None
     """File with the true light; None if it is not known."""
     from_capture: bool = True
-    """Whether the object's own capture is known; without it, its old light is unknown, too."""
+    """Whether the object's own capture is known; if not, its old light is unknown, too."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Seconds of the steps that all methods share."""
     views: Path | None = None

@@ -47,7 +47,7 @@ class EvaluateBenchmark:
     options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(quality="draft", device="auto"))
 
     def execute(self, console: Console) -> int:
-        """Run what is missing and write the report; return 1 if a scene or a method failed."""
+        """Run the missing steps and write the report; return 1 if a scene or a method failed."""
         methods = tuple(Method.parse(text) for text in self.methods)
         composition = CompositionOptions(self.options, cast(Device, self.options.device), self.birefnet)
         run = BenchmarkRun(self.out, self._scenes(), methods, composition, self.weights, self.harmonizer_weights)

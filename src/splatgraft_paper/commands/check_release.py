@@ -71,7 +71,7 @@ class CheckRelease:
     device: Device = "auto"
 
     def execute(self, console: Console) -> int:
-        """Harmonise what is missing, and write the comparison."""
+        """Harmonise the missing views, and write the comparison."""
         if self.views < 1:
             raise ValueError(f"--views: expected at least 1, found {self.views}")
         scenes = [

@@ -94,7 +94,7 @@ class Exam:
         return BenchmarkSize(read_render_size(self.pixels, SIZE.render.samples), self.views)
 
     def _scene_folders(self, out: Path, console: Console) -> Iterator[tuple[str, partial[Path]]]:
-        """Yield the name of each scene, and a function that renders what is missing of it and returns its folder."""
+        """Yield the name of each scene, and a function that renders its missing files and returns its folder."""
         if self.scenes_from is not None:
             folders = sorted(path.parent for path in self.scenes_from.glob("*/placement.json"))
             for folder in folders[: self.scenes]:

@@ -30,7 +30,7 @@ from splatgraft_paper.training.recipes import option_words
 
 @dataclass(frozen=True)
 class Stage:
-    """One command, and what it needs."""
+    """One command and its requirements."""
 
     name: str
     after: str
@@ -131,7 +131,7 @@ class Reproduce:
         return 0
 
     def jobs(self) -> dict[str, Job]:
-        """Describe the stages by name, for their records; paths below the folder of results may change with it."""
+        """Describe the stages by name, for their records; the folder of results may move, so it is named OUT."""
         names = [stage.name for stage in STAGES if stage.name != "pairs" or self.pairs is None]
         if unknown := sorted(set(self._given) - {TRAININGS, *names}):
             raise ValueError(

@@ -50,7 +50,7 @@ class SynthPairs:
     workers: RenderWorkers = field(default_factory=RenderWorkers)
 
     def execute(self, console: Console) -> int:
-        """Render what is missing and check everything; return 1 if a scene failed or a pair is faulty."""
+        """Render missing pictures and check everything; return 1 if a scene failed or a pair is faulty."""
         scenes = pairs.PAPER_SCENES if self.paper else self.scenes
         plan = pairs.PairPlan(
             objects=2 if self.paper else self.objects,
@@ -108,7 +108,7 @@ class SynthBenchmark:
     workers: RenderWorkers = field(default_factory=RenderWorkers)
 
     def execute(self, console: Console) -> int:
-        """Render what is missing, write the scenes as captures and check them; return 1 if one failed."""
+        """Render missing files, write the scenes as captures and check them; return 1 if one failed."""
         size = self._size()
         planned = {which: list(zip(benchmark.plan(which, size), self._folders(which), strict=True))
                    for which in self._chosen()}  # fmt: skip

@@ -69,7 +69,7 @@ class EvaluatePaper:
     options: ReconstructOptions = field(default_factory=lambda: ReconstructOptions(quality="draft", device="auto"))
 
     def execute(self, console: Console) -> int:
-        """Measure and run what is missing and write the tables; return 1 if a method failed or nothing was measured."""
+        """Run and measure missing results and write the tables; return 1 if a method failed or nothing was measured."""
         scenes = self._chosen(find_scenes(self.data, named_folders(self.names)))
         missing_metrics = unmeasurable_metrics(self.weights)
         for name, reason in missing_metrics.items():

@@ -67,7 +67,7 @@ def draw_scenes(
 def render_scene(
     which: BenchmarkScene, out: Path, blender_python: Path, *, jobs: int, size: BenchmarkSize = SIZE
 ) -> Path:
-    """Render what is missing of a scene into renders/ and scenes/ of `out`, and return its folder."""
+    """Render the missing files of a scene into renders/ and scenes/ of `out`, and return its folder."""
     folder = out / "scenes" / which.name
     if not (folder / TRUE_LIGHT_FILE).is_file():  # this file is written last
         sides = [out / "renders" / f"{which.name}_{side}" for side in ("target", "source")]

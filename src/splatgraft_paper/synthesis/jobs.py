@@ -44,7 +44,7 @@ class Take:
     name: str
     """Name of the take and of its folder."""
     scene: bool
-    """Whether the scene is rendered; without it the background is transparent."""
+    """Whether the scene is rendered; if not, the background is transparent."""
     object: str = ""
     """Name of the rendered object; empty for none."""
     passes: tuple[Pass, ...] = ("color",)
@@ -107,7 +107,7 @@ def _description(job: Job, out: Path) -> str:
 
 
 def render_job(job: Job, out: Path, blender_python: Path) -> None:
-    """Render what is missing in `out`, and write job.json and render.log; an interrupted job can be repeated."""
+    """Render missing files into `out`, and write job.json and render.log; an interrupted job can be repeated."""
     if job.is_done(out):
         return
     out.mkdir(parents=True, exist_ok=True)

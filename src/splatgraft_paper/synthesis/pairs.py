@@ -2,7 +2,7 @@
 
 Files of a scene and camera arc, in `<out>/<scene>_<arc>/`:
 
-    job.json, cameras.json, exposure.json    what was rendered, poses (OpenGL axes), exposures
+    job.json, cameras.json, exposure.json    the job, poses (OpenGL axes), exposures
     background/0000.png ...                  the scene without any object, 8-bit sRGB, one file per camera
     object0/0000.png, 0000_mask.png          with object 0: the consistent target; soft coverage by the object
     object0_light0/0000.png                  object 0 alone under another environment map, RGBA, straight alpha

@@ -56,7 +56,7 @@ class MeasuredModels:
     """Table 3."""
 
     values: Mapping[str, Mapping[str, float]]
-    """By model: `psnr Blender`, .., `fid ORIDa`, and the means over the sources, `psnr Average`, ..."""
+    """Metrics by model: `psnr Blender`, .., `fid ORIDa`, and means over the sources, `psnr Average`, ..."""
     notes: tuple[str, ...] = ()
     """Models whose training is not known, one sentence each."""
 

@@ -173,8 +173,8 @@ def held_out_stems(stems: Sequence[str]) -> list[str]:
 def match_views(wanted: Sequence[str], found: dict[str, Path]) -> tuple[dict[str, Path], str]:
     """Match a method's pictures to views, and describe how.
 
-    Pictures are matched by name, or by order if they are numbered, as by 3DGS's render.py, and their number is that of
-    all views or of the held-out views. The result is empty if neither fits.
+    Pictures are matched by name, else by order. Order requires numbers as names, as from 3DGS's render.py, and one
+    picture for each view or for each held-out view. The result is empty if neither fits.
     """
     if same := {stem: found[stem] for stem in wanted if stem in found}:
         return same, f"{len(same)} of {len(wanted)} views by name"

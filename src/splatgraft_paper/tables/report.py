@@ -374,7 +374,7 @@ def _figure_row(
 
 
 def _changed_part(images: Mapping[str, Float[Tensor, "h w 3"]]) -> tuple[slice, slice]:
-    """Find the third of a view, along each side, in which the object differs most from its truth or the background."""
+    """Find the third of a view, along each side, with the largest change from the composite to truth or background."""
     first = next(iter(images.values()))
     pair = [images[name] for name in ("composite", "truth", "background") if name in images][:2]
     size = (first.shape[0] // 3, first.shape[1] // 3)

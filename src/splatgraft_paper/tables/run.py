@@ -1,4 +1,4 @@
-"""One run on the authors' data set: measures their pictures, runs our methods, and explains what is missing."""
+"""One run on the authors' data set: measures their pictures, runs our methods, and gives reasons for gaps."""
 
 import json
 from collections.abc import Mapping
@@ -105,7 +105,7 @@ class _Found:
 
 
 def perform_paper_run(run: PaperRun, not_measured: Mapping[str, str], console: Console) -> PaperResults:
-    """Measure and run what is missing, except for the models of the data ablation."""
+    """Run and measure missing results, except for the models of the data ablation."""
     weights = run.ours.methods.weights
     metrics = MetricOptions(weights, "lpips" not in not_measured, "fid and kid" not in not_measured, run.ours.device)
     found = _Found(metrics, console)

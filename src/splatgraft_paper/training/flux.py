@@ -35,7 +35,7 @@ from splatgraft_paper.training.tiny_base import TinyBaseOptions, write_tiny_base
 
 Times = Literal["uniform", "schnell"]
 TINY = "tiny"
-"""Name that stands for a base model of three million weights, which is made first, in OUT/base."""
+"""Name of a base model of three million weights, which is made first, in OUT/base."""
 _BASE_PICTURES = 1200  # maximum number of pictures for training the tiny base model's autoencoder
 # attention and feed-forward layers of all blocks
 _LORA_TARGETS = (
@@ -206,7 +206,7 @@ def train_flux(out: Path, options: FluxTrainingOptions, console: Console) -> Pat
 
 
 def training_memory(options: FluxTrainingOptions, loop: LoopOptions, processes: int) -> TrainingMemory:
-    """Compute the memory of a training from the tensors of its network, none of which is made.
+    """Compute a training's memory from the shapes of its network's tensors, without allocating them.
 
     A base that is not on this machine counts as FLUX.1-schnell.
     """

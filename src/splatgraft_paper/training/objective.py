@@ -225,7 +225,7 @@ def train_objective(
         out / "latents", objective.autoencoder.encode, width=data.width, height=data.height, autoencoder=name
     )
     task = ObjectiveTask(objective, data, cache, options)
-    # only the first process locks the folder; the others write nothing but latents, each file atomically
+    # only the first process locks the folder; the others write only latents, each file atomically
     with console.bar("train") as progress, locked(out) if first else nullcontext():
         state = train(task, options, out, say=say, progress=progress)
         if first:

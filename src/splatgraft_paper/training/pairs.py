@@ -38,7 +38,7 @@ class TrainingPair:
     """One training pair, sRGB in [0, 1]."""
 
     composite: Float[Tensor, "h w 3"]
-    """Object under another light, pasted onto the scene without it (paper, Eq. 2)."""
+    """Object under another light, pasted onto the background (paper, Eq. 2)."""
     target: Float[Tensor, "h w 3"]
     """Object in the scene."""
     background: Float[Tensor, "h w 3"]

@@ -137,11 +137,11 @@ class TrainingMemory:
     state: int
     """Weights, gradients, both moments of Adam and the average, over all processes that share them."""
     device: float
-    """On each GPU, or in each process on the CPU."""
+    """Memory of each GPU, or of each process on the CPU."""
     host: float
-    """Of a machine whose processes all load the weights at once."""
+    """Memory of a machine whose processes all load the weights at once."""
     disk: float
-    """States and model at the most, without latents."""
+    """Largest size of states and model, without latents."""
 
     @staticmethod
     def of(network: Any, loop: LoopOptions, processes: int, *, tokens: int, checkpointing: bool) -> "TrainingMemory":

@@ -1,8 +1,8 @@
 """Score and figures of a model.
 
 The score is the share of photos with a pose times the share of verified matches that the model explains. A match is
-explained if both its features see the same point, and if at least `MIN_TRACK` photos see this point with a mean error
-of at most `MAX_ERROR_PX`. Unlike the reprojection error, the score counts the matches that COLMAP dropped.
+explained if both its features observe one point. At least `MIN_TRACK` photos must observe this point, with a mean
+error of at most `MAX_ERROR_PX`. Unlike the reprojection error, the score counts the matches that COLMAP dropped.
 """
 
 from collections import Counter
@@ -40,8 +40,8 @@ def read_matches(database: Path) -> Matches:
 def best_of(database: Path, models: list[Any], photos: int) -> Answer:
     """Return the best of `models` as plain numbers, without images if there are no models.
 
-    Among models of nearly equal score, the reprojection error decides. If nearly all matches are explained, a model
-    with a wrong lens can explain as many as one with the right lens.
+    Among models of nearly equal score, the one with the smallest reprojection error is best, because a model with a
+    wrong lens can also explain nearly all matches.
     """
     if not models:
         return {"images": [], "points": [], "mean_reprojection_px": 0.0, "explained": 0.0, "score": 0.0}

@@ -66,7 +66,7 @@ def read_geotag(path: Path) -> Geotag:
         gps_time=read("GPSDateStamp, GPSTimeStamp", _gps_time, gps.get(GPS.GPSDateStamp), gps.get(GPS.GPSTimeStamp)),
         camera_time=read("DateTimeOriginal", _camera_time, camera.get(Base.DateTimeOriginal)),
         camera_offset=read("OffsetTimeOriginal", _offset, camera.get(Base.OffsetTimeOriginal)),
-        # latitude and longitude 0 stand for an unknown place
+        # latitude and longitude 0 mean an unknown place
         position=(*place, -altitude if altitude and below_sea else altitude) if place and any(place) else None,
         heading_deg=read("GPSImgDirection", lambda value: _within(value, 0, 360), gps.get(GPS.GPSImgDirection)),
         heading_is_true=gps.get(GPS.GPSImgDirectionRef) == "T",
@@ -147,7 +147,7 @@ def exif_of(exposure: Exposure) -> Image.Exif:
 
 
 def _number(value: object) -> float | None:
-    """Convert a tag's value, or the first of several, to a finite number; None if it is none."""
+    """Convert a tag's value, or the first of several, to a finite number; None if it is not one."""
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         value = value[0] if value else None
     if not isinstance(value, int | float | IFDRational):

@@ -234,7 +234,7 @@ def _pinhole(view: ViewRecord, source: Path) -> tuple[np.ndarray, Distortion | N
 
 
 def _unique_names(views: Sequence[ViewRecord], source: Path) -> tuple[str, ...]:
-    """Name views by their files, with as many folders before as make the names unique, joined by underscores."""
+    """Name views by their files and as few folders as make the names unique, joined by underscores."""
     parts = [[p for p in Path(v.image_path or v.name).parts if p not in ("..", ".", "/")] for v in views]
     for depth in range(1, 1 + max(map(len, parts), default=0)):
         names = tuple("_".join(part[-depth:]) for part in parts)

@@ -262,7 +262,7 @@ def palette(rows: Float[Tensor, "n f"], size: int) -> tuple[Float[Tensor, "p f"]
         if not len(chosen):
             continue
         own = rows[chosen]
-        # rounded down, but at least one; at most `size` in all, because there are at most as many groups
+        # rounded down, but at least one; the sum is at most `size`, because there are at most `size` groups
         share = max(1, int(len(chosen) / n * (size - len(members))))
         means = k_means(own, own[_spread(len(own), share)], rounds=_ROUNDS)
         entries.append(means)

@@ -367,7 +367,7 @@ class _ShadowEvidence:
 def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float = _DECISIVE) -> Sun | None:
     """Find the sun whose shadows a level surface shows, in the region or else in a wider one.
 
-    Without a clock, the wider region is at most as large as the cameras' distance: there is none around an object that
+    Without a clock, the wider region is at most as large as the cameras' distance. So it is left out if the object
     fills the views.
 
     Args:
@@ -401,7 +401,7 @@ def _find_sun_within(captured: CapturedScene, region: BoundingSphere, decisive: 
 
 
 def _prior_by_clock(clock: ClockSun | None) -> LogPrior:
-    """Return the log density by the clock's candidates, any of which may be wrong; even without a clock."""
+    """Return the log density by the clock's candidates, which may all be wrong; uniform without a clock."""
     towards = clock_directions(clock)
     if clock is None or not len(towards):
         return lambda directions: torch.zeros(len(directions))

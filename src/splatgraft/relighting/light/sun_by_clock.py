@@ -102,7 +102,7 @@ def _costs(
     rest: Float[Tensor, "k 3"],
     direction: Float[Tensor, "3"],
 ) -> Float[Tensor, "r"]:
-    """Compute the negative log likelihood of each of `_STRENGTHS`, but for a constant."""
+    """Compute the negative log likelihood of each of `_STRENGTHS`, up to a constant."""
     gray, sines = rest.mean(1).double(), (DIRECTIONS @ evidence.up).clamp_min(0).double()
     at = int((DIRECTIONS @ direction).argmax())
     # radiance of the direction that gives the sun's irradiance on level ground

@@ -1,4 +1,4 @@
-"""Soft shadows of a compact object: irradiance at points with and without it, and the bounce of its unlit side.
+"""Soft shadows of a compact object: irradiance with and without the object, and the bounce of its unlit side.
 
 Percentage-closer soft shadows (Fernando 2005) from one prefiltered depth map per light sample: a blocker search gives
 the penumbra's width, then a second filter of that width gives visibility.

@@ -1,6 +1,6 @@
 """Shadow and bounce ratios: the change of the light at points of a scene by an object.
 
-Differential rendering (Debevec 1998): the ratio of irradiance with the object to irradiance without it.
+Differential rendering (Debevec 1998): the ratio of the irradiances with and without the object.
 
 1. Splat depth maps from every light sample: of an object (`object_shadow_maps`), of the scene (`scene_shadow_maps`).
 2. Look up visibility: past the scene (`scene_visibility`), past the object itself (`self_visibility`).
@@ -146,7 +146,7 @@ def scene_visibility(
 ) -> Float[Tensor, "m k"]:
     """Look up the visibility of every light sample from `points` past the scene.
 
-    With it, an object does not darken the scene's existing shadows again.
+    This keeps an object from darkening the scene's existing shadows again.
 
     Args:
         maps: The scene's shadow maps for k samples.
@@ -171,7 +171,7 @@ class SceneRatio:
     shadow: Float[Tensor, "m 3"]
     """Share of linear light that the object leaves, in (0, 1]; exactly 1 out of reach."""
     bounce: Float[Tensor, "m 3"]
-    """Light reflected by the object over the light without it."""
+    """Light reflected by the object, over the light without the object."""
     slope: Float[Tensor, "m 3"]
     """View dependence, world axes: slope . d is added to both in all channels for the unit view direction d."""
 

@@ -168,7 +168,7 @@ def add_part(part, name, meshes):
 
 
 def add_model(model):
-    """Import a .glb and return its meshes; it needs no other objects in Blender with the file's names."""
+    """Import a .glb and return its meshes; objects in Blender must have other names than those in the file."""
     before = set(bpy.data.objects)
     bpy.ops.import_scene.gltf(filepath=model["path"])
     made = [thing for thing in bpy.data.objects if thing not in before]

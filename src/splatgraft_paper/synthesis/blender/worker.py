@@ -108,7 +108,7 @@ def _done(folder, index, seconds):
 
 
 def main(path):
-    """Render what is missing of the job at `path`."""
+    """Render the missing files of the job at `path`."""
     with open(path, encoding="utf-8") as source:
         job = json.load(source)
     os.makedirs(job["out"], exist_ok=True)
