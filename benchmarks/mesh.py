@@ -69,6 +69,7 @@ def reconstructed(folder: Path, work: Path) -> Gaussians:
     scene = work / "target" / "scene" / "scene.ply"
     if not scene.is_file():
         capture = read_capture(folder / "target")
+        (work / "target" / "capture").mkdir(parents=True, exist_ok=True)
         write_capture(work / "target" / "capture", capture.select(~held_out(len(capture), HELD_OUT_EVERY)))
         options = ReconstructOptions(iterations=1000, budget=20_000)
         perform(Reconstruct(work / "target" / "capture", scene.parent, options=options), Console())
