@@ -15,7 +15,7 @@ from editor import served
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-SIZE = {"width": 1300, "height": 540}
+WINDOW_WIDTH, WINDOW_HEIGHT = 1300, 540
 WIDTH, QUALITY, LONGEST_MS = 650, 55, 1000
 STEPS, HANG_LIMIT = 14, 300.0
 # places in the window, pixels, in the view after the orbit
@@ -39,8 +39,10 @@ class Recorder:
         self.page, self._pictures = page, []
 
     def shoot(self) -> None:
-        """Take a picture."""
-        self._pictures.append((time.monotonic(), self.page.screenshot(type="jpeg", quality=95)))
+        """Take a picture; it is dropped if it equals the last one."""
+        at, shot = time.monotonic(), self.page.screenshot(type="jpeg", quality=95)
+        if not self._pictures or shot != self._pictures[-1][1]:
+            self._pictures.append((at, shot))
 
     def drag(self, start: tuple[int, int], end: tuple[int, int]) -> None:
         """Drag the pointer, with pictures on the way."""
@@ -72,13 +74,9 @@ class Recorder:
             self.page.wait_for_timeout(250)
         self.shoot()
 
-    def _changes(self) -> list[int]:
-        shots = [shot for _, shot in self._pictures]
-        return [i for i in range(len(shots)) if i == 0 or shots[i] != shots[i - 1]]
-
     def write(self, file: Path) -> None:
-        """Write an animated WebP; equal neighbours are one picture."""
-        times, shots = zip(*(self._pictures[i] for i in self._changes()), strict=True)
+        """Write an animated WebP."""
+        times, shots = zip(*self._pictures, strict=True)
         images = [Image.open(io.BytesIO(shot)).convert("RGB") for shot in shots]
         images = [
             image.resize((WIDTH, WIDTH * image.height // image.width), Image.Resampling.LANCZOS) for image in images
@@ -93,7 +91,7 @@ def record(project: Path, file: Path) -> None:
         browser = driver.chromium.launch(
             executable_path="/usr/bin/chromium", args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
         )
-        page = browser.new_page(viewport=SIZE)
+        page = browser.new_page(viewport={"width": WINDOW_WIDTH, "height": WINDOW_HEIGHT})
         page.add_init_script(CURSOR)
         page.goto(address)
         recorder = Recorder(page)

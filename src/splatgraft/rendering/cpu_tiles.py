@@ -68,21 +68,12 @@ def _tile_span(splat, row, tiles_x):
 
 @kernel
 @no_type_check
-def _tile_rows(splat, tiles_y):
-    """Compute the first and one past the last tile row that the ellipse can meet."""
-    top = (splat[MY] - splat[REACH_Y] - 1e-3) / TILE
-    bottom = (splat[MY] + splat[REACH_Y] + 1e-3) / TILE
+def _tile_range(middle, reach, tiles):
+    """Compute the first and one past the last tile, along one axis, that an ellipse of this half width can meet."""
+    low = (middle - reach - 1e-3) / TILE
+    high = (middle + reach + 1e-3) / TILE
     # truncation is floor, because no value is below 0
-    return int(max(min(top, 1e6), 0.0)), int(max(min(bottom + 1.0, float(tiles_y)), 0.0))
-
-
-@kernel
-@no_type_check
-def _tile_columns(splat, tiles_x):
-    """Compute the first and one past the last tile column that the ellipse can meet."""
-    left = (splat[MX] - splat[REACH_X] - 1e-3) / TILE
-    right = (splat[MX] + splat[REACH_X] + 1e-3) / TILE
-    return int(max(min(left, 1e6), 0.0)), int(max(min(right + 1.0, float(tiles_x)), 0.0))
+    return int(max(min(low, 1e6), 0.0)), int(max(min(high + 1.0, float(tiles)), 0.0))
 
 
 @kernel(parallel=True)
@@ -95,7 +86,7 @@ def _pack(splats, order, tiles_y, packed, row_counts):
             g = order[s]
             for column in range(COLUMNS):
                 packed[s, column] = splats[g, column]
-            top, bottom = _tile_rows(packed[s], tiles_y)
+            top, bottom = _tile_range(packed[s, MY], packed[s, REACH_Y], tiles_y)
             row_counts[s] = max(bottom - top, 0)
 
 
@@ -114,8 +105,8 @@ def _count(packed, first_row, tiles_x, tiles_y, spans, listed, counts):
     m = packed.shape[0]
     for chunk in prange(_CHUNKS):
         for s in range(m * chunk // _CHUNKS, m * (chunk + 1) // _CHUNKS):
-            top, _ = _tile_rows(packed[s], tiles_y)
-            low, high = _tile_columns(packed[s], tiles_x)
+            top, _ = _tile_range(packed[s, MY], packed[s, REACH_Y], tiles_y)
+            low, high = _tile_range(packed[s, MX], packed[s, REACH_X], tiles_x)
             number = 0
             for place in range(first_row[s], first_row[s + 1]):
                 row, left, right = top + place - first_row[s], low, high
@@ -136,7 +127,7 @@ def _list(packed, first_row, tiles_x, tiles_y, spans, first, free, entries, slot
     for chunk in prange(_CHUNKS):
         for s in range(m * chunk // _CHUNKS, m * (chunk + 1) // _CHUNKS):
             slot = first[s]
-            top, _ = _tile_rows(packed[s], tiles_y)
+            top, _ = _tile_range(packed[s, MY], packed[s, REACH_Y], tiles_y)
             for place in range(first_row[s], first_row[s + 1]):
                 row_at = (top + place - first_row[s]) * tiles_x
                 for tile in range(row_at + spans[place, 0], row_at + spans[place, 1]):
