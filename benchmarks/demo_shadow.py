@@ -28,7 +28,7 @@ from splatgraft.core.images import LUMINANCE
 from splatgraft.folders.composite_folder import read_composite
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.relighting.captured_scene import CapturedScene
-from splatgraft.relighting.light.sun import SurfacePicture, draw_surface, find_surface, standing_on
+from splatgraft.relighting.light.sun import SurfacePicture, draw_surface, find_surfaces, standing_on
 from splatgraft.relighting.shadows.shadow_maps import occluders_of
 
 SUN = F.normalize(torch.tensor([-0.26938, 0.91658, 0.29548]), dim=0)
@@ -68,8 +68,7 @@ def shadows_of(demo: Path, folders: tuple[str, ...]) -> Iterator[tuple[str, floa
     place = bounding_sphere(placed)
     region = BoundingSphere(place.center, _RADII * place.radius)
     captured = CapturedScene(scene, cameras)
-    surface = find_surface(captured, region)
-    assert surface is not None
+    surface = find_surfaces(captured, region)[0]
     cup = surface.shadows(standing_on(surface, scene, region), SUN[None])[0]
     bananas = surface.shadows(occluders_of(placed), SUN[None])[0]
     table = luminance(draw_surface(captured, surface))

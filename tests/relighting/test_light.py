@@ -38,13 +38,15 @@ from splatgraft.relighting.light.panorama import (
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.sun import (
     SET_BY_HAND,
+    Sun,
     _find_sun_within,
     direction_through,
     find_sun,
     set_sun,
+    sun_near,
     with_sun,
 )
-from splatgraft.relighting.light.sun_by_clock import BY_CLOCK, find_sun_by_clock
+from splatgraft.relighting.light.sun_by_clock import BY_CLOCK, direction_by_clock, sun_towards
 
 
 def shell(colors, directions, *, radius=2.0, spread=0.12):
@@ -451,24 +453,62 @@ def test_shadows_far_from_a_small_object_show_the_sun(place):
     assert degrees_apart(found.sun.direction, sun) < 3
 
 
-def test_shading_and_highlights_show_how_strong_the_sun_of_the_clock_is():
+def test_shadows_that_prove_no_sun_move_one_that_exists():
+    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+    noise = torch.randn(20000, generator=torch.Generator().manual_seed(3))
+    scene = painted(sunlit_scene(sun, 3.0), lambda means: noise[: len(means)].exp())
+    captured = CapturedScene(scene, views())
+    # in the wider region lie the balls and their shadows, on a floor whose texels differ by a factor of e
+    region = BoundingSphere(torch.tensor([1.8, 0.0, 0.3]), 0.8)
+    assert _find_sun_within(captured, region, 40.0) is None
+    right, down = tangents(sun)
+    for aside in (right, -down):
+        estimated = torch.nn.functional.normalize(sun + math.tan(math.radians(12.0)) * aside, dim=0)
+        moved = sun_near(estimated, 8.0, captured, region)
+        assert degrees_apart(moved.direction, sun) < 3
+        assert moved.error_deg < 4
+    # without shadows nothing changes
+    away = sun_near(estimated, 8.0, captured, BoundingSphere(torch.tensor([20.0, 0.0, 0.3]), 0.3))
+    assert torch.equal(away.direction, estimated)
+    assert away.error_deg == 8.0
+    assert away.ratio is None
+
+
+def test_shadows_of_a_sun_that_exists_show_its_strength():
+    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+    estimated = torch.nn.functional.normalize(sun + math.tan(math.radians(12.0)) * tangents(sun)[0], dim=0)
+    found = sun_near(
+        estimated, 8.0, CapturedScene(sunlit_scene(sun, 3.0), views()), BoundingSphere(torch.zeros(3), 0.8)
+    )
+    assert degrees_apart(found.direction, sun) < 3
+    assert found.ratio is not None
+    assert found.ratio.tolist() == pytest.approx([3 * float(sun[2])] * 3, rel=0.25)
+
+
+def test_a_direction_by_the_clock_is_averaged_with_a_source_that_may_be_the_sun():
+    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+    assert direction_by_clock(None, None) is None
+    alone = direction_by_clock(clock_at(sun), None)
+    assert alone is not None
+    assert torch.equal(alone[0], sun)
+    assert alone[1] == 5.0
+    # a source 8 degrees away with the same error may be the sun: the mean is half as far
+    off = torch.nn.functional.normalize(sun + 0.14 * torch.linalg.cross(sun, UP), dim=0).tolist()
+    near = LightSource((off[0], off[1], off[2]), (1.0, 1.0, 1.0), uncertainty_deg=5.0)
+    joined = direction_by_clock(clock_at(sun), near)
+    assert joined is not None
+    assert degrees_apart(joined[0], sun) == pytest.approx(degrees_apart(torch.tensor(off), sun) / 2, rel=0.01)
+
+
+def test_shading_and_highlights_show_how_strong_a_sun_in_a_known_direction_is():
     sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     place, found = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3), {}
     for strength in (0.0, 3.0):
         estimate = estimate_light(CapturedScene(sunlit_scene(sun, strength), views()), place)
         assert isinstance(estimate, EstimatedLight)
         problem = radiance_problem(estimate.evidence)
-        found[strength] = find_sun_by_clock(clock_at(sun), problem, estimate.evidence, estimate.rest(), main=None)
-        assert find_sun_by_clock(None, problem, estimate.evidence, estimate.rest(), main=None) is None
-        if strength:
-            # a source 8 degrees away with the same error may be the sun: the mean is half as far
-            off = torch.nn.functional.normalize(sun + 0.14 * torch.linalg.cross(sun, UP), dim=0).tolist()
-            near = LightSource((off[0], off[1], off[2]), (1.0, 1.0, 1.0), uncertainty_deg=5.0)
-            joined = find_sun_by_clock(clock_at(sun), problem, estimate.evidence, estimate.rest(), main=near)
-            assert joined is not None
-            assert degrees_apart(joined.direction, sun) == pytest.approx(
-                degrees_apart(torch.tensor(off), sun) / 2, rel=0.01
-            )
+        unmeasured = Sun(sun, 1.0, UP, None, 0.0, 5.0, BY_CLOCK)
+        found[strength] = sun_towards(unmeasured, problem, estimate.evidence, estimate.rest())
     bright, hidden = found[3.0], found[0.0]
     assert bright is not None
     assert bright.name == BY_CLOCK

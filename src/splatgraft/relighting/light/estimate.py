@@ -3,7 +3,9 @@
 1. Collect the evidence: panorama, shading of surfaces, highlights.
 2. Find the radiance of 320 directions that explains it (`radiance_search.py`).
 3. Turn peaks of that radiance into sources, and the rest into ambient light of degree 2.
-4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it.
+4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it. Otherwise the clock of
+   the photos knows a sun; or the brightest source is one, if no camera saw it and the place is out of doors. It moves
+   to the shadows, and its strength is what they show, or what shading and a clear sky's prior give.
 5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
 """
 
@@ -34,8 +36,8 @@ from splatgraft.relighting.light.panorama import (
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
-from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, with_sun
-from splatgraft.relighting.light.sun_by_clock import find_sun_by_clock
+from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, sun_near, with_sun
+from splatgraft.relighting.light.sun_by_clock import BY_CLOCK, direction_by_clock, sun_towards
 from splatgraft.rendering import render
 
 # the evidence; set by hand
@@ -52,6 +54,8 @@ _SUN = 0.03  # steradians; a smaller clipped patch may show the sun, whose rays 
 _LAMP = 0.64  # sine of the height above which a source in a room is named a lamp, otherwise a window
 _SEEN_NAMES = ("window", "lamp")  # low and high sources with a surface behind them
 _UNSEEN_NAMES = ("sun or window", "sun or lamp")  # low and high sources that no camera saw
+_ABOVE_HORIZON = (0.1, 0.4)  # sines of the heights at which walls end the view in a room
+_OPEN = 4.0  # distance there over that of the cameras, above which a place is out of doors; rooms have up to 3.1
 _UNSEEN_RADIUS_DEG = 1.0  # angular radius of a source that no camera saw, beside the uncertainty of its direction
 
 # the view towards a source; set by hand
@@ -148,12 +152,26 @@ def estimate_light(
     problem = radiance_problem(evidence)
     hidden = search_radiance(problem)
     sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
-    mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
-    found = EstimatedLight(mean, None, hidden, evidence, place)
+    main = next(iter(sources), None)
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
     if sun is None:
-        sun = find_sun_by_clock(captured.clock, problem, evidence, rest, main=next(iter(sources), None))
+        known = direction_by_clock(captured.clock, main)
+        if known is None and main is not None and main.name in _UNSEEN_NAMES and _is_outdoors(evidence, cameras):
+            known = torch.tensor(main.direction), main.uncertainty_deg
+        if known is not None:
+            shown = sun_near(*known, whole, region, name="sun" if captured.clock is None else BY_CLOCK)
+            sun = sun_towards(shown, problem, evidence, rest) if shown.ratio is None else shown
+    mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
+    found = EstimatedLight(mean, None, hidden, evidence, place)
     return found if sun is None else found.with_sun(sun, scene)
+
+
+def _is_outdoors(evidence: LightEvidence, cameras: Cameras) -> bool:
+    """Whether what the cameras see a little above the horizon is far away, compared with their own distance."""
+    sine = DIRECTIONS @ evidence.up
+    seen = (sine > _ABOVE_HORIZON[0]) & (sine < _ABOVE_HORIZON[1]) & (evidence.far.seen > 0.5)
+    near = float((cameras.centers - evidence.surfaces.region.center).norm(dim=1).median())
+    return bool(seen.any()) and float(evidence.far.distance[seen].median()) > _OPEN * near
 
 
 def region_around(place: BoundingSphere, cameras: Cameras) -> BoundingSphere:

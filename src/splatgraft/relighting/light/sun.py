@@ -13,12 +13,16 @@
 5. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
 6. If no direction is decisively better than no sun, do the same in a wider region.
 
+If no shadow is decisive, but shading or the clock of the photos shows a sun, `sun_near` moves it to the shadows of
+several surfaces.
+
 `set_sun` searches in the same way near the direction of points that a user marks together with their shadows.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import torch
 import torch.nn.functional as F
@@ -64,6 +68,8 @@ _APART = math.cos(math.radians(8.0))  # cosine of the minimum angle between two 
 _SPANS = ((3.0, 1.0), (1.0, 0.33))  # half width and step of the grids around a maximum, degrees
 _PROMISING = 10.0  # log likelihood over that of even light above which a direction of the search is refined
 _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
+_SURFACES = 2  # level surfaces whose shadows move a sun: a table, and the ground around it
+_STEP_DEG = 2.5  # of the grid of directions around a sun that is known to exist
 _WIDER = 3.0  # radius of the second region: few things stand near a small object, but the sun is the same
 _TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a prior, because texels share their errors
 _CLOCK_IS_WRONG = 0.05  # probability that no candidate of the clock is the sun
@@ -71,7 +77,7 @@ _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
 _MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
 _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12  # angular radii that are tried, and directions that sample each
 _UNSEEN_RADIUS_DEG = 1.0  # angular radius of a sun set by hand if no edge of a shadow shows it
-_SOFTER = 3.0  # log likelihood over a smaller radius above which a larger one is taken, 20 to 1
+_CLEAR = 3.0  # log likelihood, 20 to 1, above which a larger radius or the strength that shadows show is taken
 _ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for others
 _BY_HAND_DEG, _BY_HAND_SPAN = 15.0, (30.0, 3.0)  # standard error of points set by hand; search around their direction
 _AROUND_SHADOW = 2.5  # region in which a sun set by hand is measured, in distances from a point to its shadow
@@ -160,8 +166,8 @@ class SurfacePicture:
     """Whether enough views show the texel, neither clipped nor black."""
 
 
-def find_surface(captured: CapturedScene, region: BoundingSphere) -> Surface | None:
-    """Find the dominant level surface that the cameras see in a region, if there is one."""
+def find_surfaces(captured: CapturedScene, region: BoundingSphere, *, most: int = 1) -> list[Surface]:
+    """Find the level surfaces that the cameras see in a region, the one that shows most first, at most `most`."""
     seen = []
     for camera, drawn in captured.views:
         points = camera.unproject(drawn.depth[0])
@@ -169,13 +175,18 @@ def find_surface(captured: CapturedScene, region: BoundingSphere) -> Surface | N
         seen.append(points[is_solid & ((points - region.center).norm(dim=-1) < region.radius)])
     points = torch.cat(seen)
     points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:6000]]
-    plane = dominant_level_plane(points, captured.up, options=_PLANE)
-    if plane is None:
-        return None
-    on_it = points[plane.height(points).abs() < plane.thickness]
-    center = on_it.median(0).values
-    center = center - plane.height(center) * plane.normal
-    return Surface(plane, center, float((on_it - center).norm(dim=1).quantile(0.95)))
+    surfaces = list[Surface]()
+    while len(surfaces) < most:
+        plane = dominant_level_plane(points, captured.up, options=_PLANE)
+        if plane is None:
+            break
+        away = plane.height(points).abs()
+        on_it = points[away < plane.thickness]
+        center = on_it.median(0).values
+        center = center - plane.height(center) * plane.normal
+        surfaces.append(Surface(plane, center, float((on_it - center).norm(dim=1).quantile(0.95))))
+        points = points[away > 2 * plane.thickness]
+    return surfaces
 
 
 def draw_surface(captured: CapturedScene, surface: Surface) -> SurfacePicture:
@@ -311,15 +322,20 @@ class _ShadowEvidence:
     """Share of all other light that reaches the texels."""
 
     @staticmethod
-    def of(captured: CapturedScene, region: BoundingSphere) -> "_ShadowEvidence | None":
-        """Collect the evidence in a region; None if it has no level surface, too few texels, or no occluders."""
-        surface = find_surface(captured, region)
-        if surface is None:
-            return None
-        standing, picture = standing_on(surface, captured.gaussians, region), draw_surface(captured, surface)
-        if not len(standing.means) or int(picture.valid.sum()) < _MIN_TEXELS:
-            return None
-        return _ShadowEvidence(picture, standing, surface.ambient(standing))
+    def of(captured: CapturedScene, region: BoundingSphere, *, most: int = 1) -> "list[_ShadowEvidence]":
+        """Collect the evidence of level surfaces in a region, without those with too few texels or no occluders.
+
+        Args:
+            captured: The scene.
+            region: Sphere that contains the surfaces and the occluders on them.
+            most: Maximum number of surfaces.
+        """
+        found = []
+        for surface in find_surfaces(captured, region, most=most):
+            standing, picture = standing_on(surface, captured.gaussians, region), draw_surface(captured, surface)
+            if len(standing.means) and int(picture.valid.sum()) >= _MIN_TEXELS:
+                found.append(_ShadowEvidence(picture, standing, surface.ambient(standing)))
+        return found
 
     @property
     def surface(self) -> Surface:
@@ -328,6 +344,14 @@ class _ShadowEvidence:
     def above(self, directions: Float[Tensor, "k 3"]) -> Float[Tensor, "m 3"]:
         """Select the directions above the surface."""
         return directions[directions @ self.surface.plane.normal > _LOWEST]
+
+    def log_likelihoods(self, directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
+        """Compute the log likelihood of suns in k directions over that of even light, without the finest edges."""
+        coarse = _Comparison.of(self.picture, _COARSE)
+        every = coarse.every
+        ambient = self.ambient[::every, ::every]
+        visible = (self.surface.shadows(self.standing, part, every) for part in directions.split(64))  # bounds memory
+        return torch.cat([coarse.of_suns(one, ambient, _STRENGTHS) for one in visible])
 
     def best(self, directions: Float[Tensor, "k 3"], log_prior: LogPrior) -> tuple[Float[Tensor, "3"], float, float]:
         """Find the sun's most probable direction.
@@ -340,12 +364,10 @@ class _ShadowEvidence:
             The direction; the log likelihood of its shadows over that of no sun, -inf if no direction is promising; and
             this with the log prior.
         """
-        coarse, fine = _Comparison.of(self.picture, _COARSE), _Comparison.of(self.picture, _FINE)
-        every, surface = coarse.every, self.surface
-        ambient, blurred_ambient = self.ambient[::every, ::every], _blurred(self.ambient[None])
+        fine, surface = _Comparison.of(self.picture, _FINE), self.surface
+        blurred_ambient = _blurred(self.ambient[None])
         without = max(0.0, float(fine.log_likelihoods(blurred_ambient)))
-        visible = (surface.shadows(self.standing, part, every) for part in directions.split(64))  # bounds memory
-        score = torch.cat([coarse.of_suns(one, ambient, _STRENGTHS) for one in visible]) + log_prior(directions)
+        score = self.log_likelihoods(directions) + log_prior(directions)
         best, likeliest, evidence = directions[0], -math.inf, -math.inf
         for _ in range(4):  # maxima that are refined
             if float(score.max()) < _PROMISING:
@@ -388,7 +410,7 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
 
 
 def _find_sun_within(captured: CapturedScene, region: BoundingSphere, decisive: float) -> Sun | None:
-    shown = _ShadowEvidence.of(captured, region)
+    shown = next(iter(_ShadowEvidence.of(captured, region)), None)
     if shown is None:
         return None
     direction, evidence, posterior = shown.best(shown.above(_DIRECTIONS), _prior_by_clock(captured.clock))
@@ -398,6 +420,51 @@ def _find_sun_within(captured: CapturedScene, region: BoundingSphere, decisive: 
     if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
         return None
     return Sun(direction, radius, shown.surface.plane.normal, ratio, evidence)
+
+
+def sun_near(
+    direction: Float[Tensor, "3"],
+    error_deg: float,
+    captured: CapturedScene,
+    region: BoundingSphere,
+    *,
+    name: str = "",
+) -> Sun:
+    """Find the sun near a direction, when it is known that there is one.
+
+    The density of its direction is normal around the given one, times the likelihoods of the shadows on each level
+    surface in the wider region. So shadows that alone prove no sun still show where it is.
+
+    Args:
+        direction: Unit vector towards the sun.
+        error_deg: Standard error of `direction`, degrees.
+        captured: The scene with all objects that cast shadows during the capture.
+        region: Sphere around the place.
+        name: Name in reports.
+
+    Returns:
+        The sun in the mean direction, with the standard error of that. Its ratio is None if no surface clearly shows
+        its shadow.
+    """
+    surfaces = _ShadowEvidence.of(captured, replace(region, radius=_WIDER * region.radius), most=_SURFACES)
+    near = _around(direction, 3 * error_deg, _STEP_DEG)
+    near = near[near @ direction > math.cos(math.radians(3 * error_deg))]
+    for one in surfaces:
+        near = one.above(near)
+    unmeasured = Sun(direction, _UNSEEN_RADIUS_DEG, captured.up, None, 0.0, error_deg, name)
+    if not surfaces or not len(near):
+        return unmeasured
+    away_deg = torch.rad2deg((near @ direction).clamp(-1, 1).acos())
+    log_density = sum((one.log_likelihoods(near) for one in surfaces), -0.5 * (away_deg / error_deg).square())
+    weights = log_density.softmax(0)
+    mean = F.normalize(weights @ near, dim=0)
+    variance = weights @ torch.rad2deg((near @ mean).clamp(-1, 1).acos()).square() / 2  # of two axes
+    moved = replace(unmeasured, direction=mean, error_deg=max(float(variance.sqrt()), _ERROR_DEG))
+    evidence, shown = max(((float(one.log_likelihoods(mean[None])), one) for one in surfaces), key=itemgetter(0))
+    radius, ratio = _radius_and_ratio(shown, mean)
+    if evidence < _CLEAR or ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
+        return moved
+    return replace(moved, radius_deg=radius, normal=shown.surface.plane.normal, ratio=ratio, evidence=evidence)
 
 
 def _prior_by_clock(clock: ClockSun | None) -> LogPrior:
@@ -443,7 +510,8 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
     direction, spread_deg = direction_through(points, captured.up)
     pairs = torch.tensor(points).reshape(-1, 2, 3)
     for caster, shadow in pairs.unbind():
-        shown = _ShadowEvidence.of(captured, BoundingSphere(shadow, _AROUND_SHADOW * float((caster - shadow).norm())))
+        around = BoundingSphere(shadow, _AROUND_SHADOW * float((caster - shadow).norm()))
+        shown = next(iter(_ShadowEvidence.of(captured, around)), None)
         near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, *_BY_HAND_SPAN))
         if shown is None or not len(near):
             continue
@@ -493,7 +561,7 @@ def _radius_and_ratio(shown: _ShadowEvidence, direction: Float[Tensor, "3"]) -> 
     for _ in range(5):  # widths of the reconstruction's blur
         by_radius = torch.maximum(by_radius, fine.of_suns(blurred[:-1], blurred[-1], _FINE_STRENGTHS))
         blurred = _blurred(blurred)
-    radius = _RADII_DEG[int((by_radius > by_radius.max() - _SOFTER).int().argmax())]
+    radius = _RADII_DEG[int((by_radius > by_radius.max() - _CLEAR).int().argmax())]
     return radius, lit_over_shaded(shown.picture, softened[0], shown.ambient)
 
 

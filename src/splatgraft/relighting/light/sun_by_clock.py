@@ -10,6 +10,7 @@ level ground over that of all other light, has a posterior:
 """
 
 import math
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -40,37 +41,35 @@ BY_CLOCK = "sun by the photos' clock"
 """Name in reports."""
 
 
-def find_sun_by_clock(
-    clock: ClockSun | None,
-    problem: RadianceProblem,
-    evidence: LightEvidence,
-    rest: Float[Tensor, "k 3"],
-    *,
-    main: LightSource | None,
-) -> Sun | None:
-    """Estimate the sun near the direction of the clock's most trusted candidate.
+def direction_by_clock(clock: ClockSun | None, main: LightSource | None) -> tuple[Float[Tensor, "3"], float] | None:
+    """Return direction and standard error, degrees, of the clock's most trusted candidate; None without one.
 
     Args:
         clock: The sun by the clock of the photos.
+        main: Brightest estimated source. If it may be the sun, its direction is averaged with the clock's.
+    """
+    directions = clock_directions(clock)
+    return _joined(directions[0], clock.error_deg, main) if clock is not None and len(directions) else None
+
+
+def sun_towards(sun: Sun, problem: RadianceProblem, evidence: LightEvidence, rest: Float[Tensor, "k 3"]) -> Sun | None:
+    """Estimate the strength of a sun in a known direction.
+
+    Args:
+        sun: The sun, without a ratio.
         problem: Density of the light at the place.
         evidence: Evidence that `problem` is made of.
         rest: Estimated radiance from all `DIRECTIONS` without the sources.
-        main: Brightest estimated source. If it may be the sun, its direction is averaged with the clock's.
 
     Returns:
-        The sun; None without a direction, or if the evidence is against a sun there.
+        The sun with its ratio; None if the evidence is against a sun there.
     """
-    directions = clock_directions(clock)
-    if clock is None or not len(directions):
-        return None
-    direction, error_deg = _joined(directions[0], clock.error_deg, main)
-    log_posterior = _log_prior(float(direction @ evidence.up))
-    log_posterior -= _costs(problem, evidence, rest, direction) / problem.settings.temperature
+    log_posterior = _log_prior(float(sun.direction @ evidence.up))
+    log_posterior -= _costs(problem, evidence, rest, sun.direction) / problem.settings.temperature
     strength = float(_STRENGTHS[log_posterior.argmax()])
     if strength < _LEAST:
         return None
-    ratio = strength * torch.tensor(_TINT)
-    return Sun(direction, _SUN_RADIUS_DEG, evidence.up, ratio, evidence=0.0, error_deg=error_deg, name=BY_CLOCK)
+    return replace(sun, radius_deg=_SUN_RADIUS_DEG, ratio=strength * torch.tensor(_TINT))
 
 
 def _joined(
