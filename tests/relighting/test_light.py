@@ -26,6 +26,7 @@ from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
+from splatgraft.relighting.light.known_sun import BY_CLOCK, direction_by_clock, sun_towards
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient, light_confidence
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
@@ -46,7 +47,6 @@ from splatgraft.relighting.light.sun import (
     sun_near,
     with_sun,
 )
-from splatgraft.relighting.light.sun_by_clock import BY_CLOCK, direction_by_clock, sun_towards
 
 
 def shell(colors, directions, *, radius=2.0, spread=0.12):

@@ -24,6 +24,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import LUMINANCE
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.evidence import find_highlights, find_shading_evidence
+from splatgraft.relighting.light.known_sun import BY_CLOCK, direction_by_clock, sun_towards
 from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
@@ -37,7 +38,6 @@ from splatgraft.relighting.light.panorama import (
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
 from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, sun_near, with_sun
-from splatgraft.relighting.light.sun_by_clock import BY_CLOCK, direction_by_clock, sun_towards
 from splatgraft.rendering import render
 
 # the evidence; set by hand
@@ -70,7 +70,8 @@ class EstimatedLight:
     mean: Light
     """Mean over the posterior."""
     sun: Sun | None
-    """Sun found from shadows, which replaces the distant sources of `mean`; None if shadows show none."""
+    """Sun that replaces the distant sources of `mean`; None if neither shadows nor the clock nor, out of
+    doors, shading show one."""
     hidden: RadianceEstimate
     """Radiance that no camera recorded."""
     evidence: LightEvidence
@@ -80,7 +81,7 @@ class EstimatedLight:
 
     @property
     def light(self) -> Light:
-        """The estimate, including the sun that shadows show."""
+        """The estimate, including the sun."""
         return self.mean if self.sun is None else with_sun(self.mean, self.sun)
 
     def rest(self) -> Float[Tensor, "k 3"]:
@@ -155,11 +156,11 @@ def estimate_light(
     main = next(iter(sources), None)
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
     if sun is None:
-        known = direction_by_clock(captured.clock, main)
+        known, name = direction_by_clock(captured.clock, main), BY_CLOCK
         if known is None and main is not None and main.name in _UNSEEN_NAMES and _is_outdoors(evidence, cameras):
-            known = torch.tensor(main.direction), main.uncertainty_deg
+            known, name = (torch.tensor(main.direction), main.uncertainty_deg), "sun"
         if known is not None:
-            shown = sun_near(*known, whole, region, name="sun" if captured.clock is None else BY_CLOCK)
+            shown = sun_near(*known, whole, region, name=name)
             sun = sun_towards(shown, problem, evidence, rest) if shown.ratio is None else shown
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, place)

@@ -1,4 +1,4 @@
-"""The sun at the direction that the clock of the photos gives, where no shadow shows it.
+"""The sun where it is known that there is one: by the clock of the photos, or as the brightest source out of doors.
 
 The clock knows where the sun stands, not whether clouds or walls hide it. So the sun's strength, its irradiance on
 level ground over that of all other light, has a posterior:
