@@ -111,6 +111,10 @@ def kept_target(target: Gaussians, objects: Sequence[Gaussians]) -> Gaussians:
     return target
 
 
+def no_height(gaussians: Gaussians, normals: Tensor) -> Tensor:
+    return torch.zeros(gaussians.count)
+
+
 def centers(gaussians: Gaussians, normals: Tensor) -> Tensor:
     return gaussians.means
 
@@ -123,7 +127,7 @@ def one_group(brightness: Tensor, normals: Tensor) -> Tensor:
     return torch.zeros(len(brightness), dtype=torch.int64)
 
 
-def past_no_scene(maps: SceneShadowMaps, points: Tensor, normals: Tensor) -> Tensor:
+def past_no_scene(maps: SceneShadowMaps, points: Tensor, normals: Tensor, **_heights: Tensor) -> Tensor:
     sources = 0 if maps.source_maps is None else len(maps.source_maps.first)
     return torch.ones(len(points), sources + len(maps.ambient_maps.first))
 
@@ -333,8 +337,8 @@ ROWS: Mapping[str, Row] = {
         "shadow of the scene on receivers, which objects do not darken again",
         {"relighting.scene_light.scene_visibility": past_no_scene},
     ),
-    "above-layer": Row(
-        "place", "receivers lit at the layer's top; at centres", {"relighting.scene_light.above_layer": centers}
+    "layer-height": Row(
+        "place", "receivers lit above the layer's top; at centres", {"relighting.scene_light.layer_height": no_height}
     ),
     "layer-middle": Row(
         "place", "surface in the layer's middle; at centres", {"relighting.scene_light.layer_middle": centers}

@@ -19,9 +19,11 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
 from splatgraft.core.similarity import Similarity
 from splatgraft.relighting import Light, LightSource, RelightOptions, SourceScene, relight
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.layers import pasted
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.relighting.light.samples import sample_light
+from splatgraft.relighting.scene_light import SceneLight, find_scene_light
 from splatgraft.relighting.shading import irradiance
 from splatgraft.relighting.shadows import view_fit
 from splatgraft.relighting.shadows.scene_ratio import DARKEST, light_sums, object_shadow_maps, scene_ratio
@@ -118,6 +120,24 @@ def test_low_light_leaves_no_acne_on_a_rough_layer():
     umbra = smooth > 0.9 * smooth.max()
     # receivers 0.01 too high or low move the edge of a shadow by 0.04, so some of the umbra's receivers leave it
     assert float(rough[umbra].median()) > 0.95 * float(smooth[umbra].median())
+
+
+def test_the_scene_s_own_shadow_stands_where_low_light_puts_it_on_a_rough_layer():
+    # a plate beside the ball; the floor's Gaussians lie up to .1 above and below the plane
+    low, side = 2.5, torch.linspace(-0.4, 0.4, 60)
+    grid = torch.stack(torch.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
+    plate = torch.cat([grid, torch.full((len(grid), 1), 0.6)], 1) - torch.tensor([0.8, 0.0, 0.0])
+    scene = concatenate([floor(half=3.0, count=100, height=0.03), surfels(plate, UP.repeat(len(plate), 1), width=0.01)])
+    light = from_above(x=low, angular_radius_deg=0.3)
+    found = find_scene_light(CapturedScene(scene, cameras()), [bounding_sphere(ball())], light=light, reach=8.0)
+    assert isinstance(found, SceneLight)
+    points = found.receivers.gaussians.means
+    x, y, z = points.unbind(1)
+    # where the ray to the light meets the plate
+    aside = torch.maximum((x + 0.8 + low * (0.6 - z)).abs(), y.abs())
+    visible, on_floor = found.receivers.sample_visibility[:, 0], z < 0.3
+    assert float(visible[on_floor & (aside < 0.36)].mean()) < 0.03
+    assert float(visible[on_floor & (aside > 0.44)].mean()) > 0.97
 
 
 def test_the_bounce_is_no_brighter_than_the_new_light_allows():

@@ -15,7 +15,7 @@ from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.light.samples import LightSamples, sample_light
 from splatgraft.relighting.light.sun import Point
-from splatgraft.relighting.shadows.receivers import RIM, Receivers, above_layer, layer_middle
+from splatgraft.relighting.shadows.receivers import RIM, Receivers, layer_height, layer_middle
 from splatgraft.relighting.shadows.scene_ratio import SceneShadowMaps, reachable, scene_shadow_maps, scene_visibility
 
 # the region of the shadow maps; set by hand
@@ -131,7 +131,7 @@ def _receivers(
     return Receivers(
         gaussians=gaussians,
         normals=normals,
-        sample_visibility=scene_visibility(maps, above_layer(gaussians, normals), normals),
+        sample_visibility=scene_visibility(maps, gaussians.means, normals, heights=layer_height(gaussians, normals)),
         surface=layer_middle(gaussians, normals),
         origin=indices,
     )

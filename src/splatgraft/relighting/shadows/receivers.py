@@ -6,7 +6,7 @@ A Gaussian has one colour, so a Gaussian wider than a shadow's edge cannot show 
 2. Split the Gaussians with the largest variation along that axis, while the budget lasts.
 
 A plain surface is a layer of Gaussians whose centres lie above and below it. The layer's middle (`layer_middle`) is the
-surface. Visibility is tested at its top (`above_layer`), because upper Gaussians would shadow lower ones (shadow acne).
+surface. Visibility is tested above its top (`layer_height`), because upper Gaussians would shadow lower ones (acne).
 """
 
 import math
@@ -217,18 +217,18 @@ def _points(gaussians: Gaussians, offsets: Float[Tensor, "2 p"]) -> Float[Tensor
     return gaussians.means[:, None] + (along @ offsets).transpose(1, 2)
 
 
-def above_layer(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Compute the top of the surface layer along each Gaussian's normal: 3 standard deviations above its middle.
+def layer_height(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Compute the height of the surface layer's top over each Gaussian: 3 standard deviations above its middle.
 
     Args:
         gaussians: n Gaussians.
         normals: Unit normals of their surfaces.
 
     Returns:
-        Points in world units.
+        World units along the normal.
     """
     middle, deviation = _layer(gaussians, normals, 16)  # neighbours, as for a normal
-    return gaussians.means + (middle + 3 * deviation)[:, None] * normals
+    return middle + 3 * deviation
 
 
 def layer_middle(gaussians: Gaussians, normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

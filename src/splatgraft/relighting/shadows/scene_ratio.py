@@ -142,7 +142,11 @@ def scene_shadow_maps(scene: Gaussians, region: BoundingSphere, samples: LightSa
 
 
 def scene_visibility(
-    maps: SceneShadowMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"]
+    maps: SceneShadowMaps,
+    points: Float[Tensor, "m 3"],
+    normals: Float[Tensor, "m 3"],
+    *,
+    heights: Float[Tensor, "m"] | None = None,
 ) -> Float[Tensor, "m k"]:
     """Look up the visibility of every light sample from `points` past the scene.
 
@@ -152,15 +156,18 @@ def scene_visibility(
         maps: The scene's shadow maps for k samples.
         points: World units.
         normals: Unit normals of the surface at each point.
+        heights: Heights of the surface's layer over the points, as for `visibility`.
 
     Returns:
         Share of each sample that arrives, in [0, 1].
     """
     source_bias, ambient_bias = _SCENE_BIAS
-    ambient = visibility(maps.ambient_maps, points, normals, bias=ambient_bias * maps.ambient_maps.texel)
+    bias = ambient_bias * maps.ambient_maps.texel
+    ambient = visibility(maps.ambient_maps, points, normals, bias=bias, heights=heights)
     if maps.source_maps is None:
         return ambient
-    of_sources = visibility(maps.source_maps, points, normals, bias=source_bias * maps.source_maps.texel)
+    bias = source_bias * maps.source_maps.texel
+    of_sources = visibility(maps.source_maps, points, normals, bias=bias, heights=heights)
     return torch.cat([of_sources, ambient], 1)
 
 

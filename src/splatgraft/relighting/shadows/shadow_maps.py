@@ -151,7 +151,12 @@ def splat_depth_maps(
 
 
 def visibility(
-    maps: DepthMaps, points: Float[Tensor, "m 3"], normals: Float[Tensor, "m 3"], *, bias: float
+    maps: DepthMaps,
+    points: Float[Tensor, "m 3"],
+    normals: Float[Tensor, "m 3"],
+    *,
+    bias: float,
+    heights: Float[Tensor, "m"] | None = None,
 ) -> Float[Tensor, "m k"]:
     """Look up the visibility of each map's light from points on a surface.
 
@@ -160,14 +165,16 @@ def visibility(
         points: World units.
         normals: Unit normals of the surface at each point.
         bias: World units; an occluder nearer than this is the surface itself.
+        heights: World units along the normal; an occluder that the light passes lower than this is the surface itself.
 
     Returns:
         Share of the light that arrives, in [0, 1]; 1 outside the window.
     """
     out = np.ones((len(points), len(maps.first)), np.float32)
     view = (_array(maps.window.frames), _array(maps.window.center), np.float32(maps.window.radius))
+    own = np.zeros(len(points), np.float32) if heights is None else _array(heights)
     _filter_visibility(
-        _array(points), _array(normals), view, (_array(maps.first), _array(maps.alpha)), np.float32(bias), out
+        (_array(points), _array(normals), own), view, (_array(maps.first), _array(maps.alpha)), np.float32(bias), out
     )
     return torch.from_numpy(out)
 
@@ -320,7 +327,8 @@ def _splat(geometry, rgb, view, limits, maps, threads):
 @serialized
 @kernel(parallel=True, fastmath=True)
 @no_type_check
-def _filter_visibility(points, normals, view, maps, bias, out):
+def _filter_visibility(receivers, view, maps, bias, out):
+    points, normals, heights = receivers
     frames, center, radius = view
     first, alpha = maps
     size = first.shape[1]
@@ -339,8 +347,9 @@ def _filter_visibility(points, normals, view, maps, bias, out):
             depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
             if u < 0 or v < 0 or u >= size - 1 or v >= size - 1:
                 continue
-            slope = np.sqrt(max(np.float32(0), 1 - cosine * cosine)) / max(abs(cosine), _FLATTEST)
-            limit = depth - bias - texel * slope
+            steepness = max(abs(cosine), _FLATTEST)
+            slope = np.sqrt(max(np.float32(0), 1 - cosine * cosine)) / steepness
+            limit = depth - bias - texel * slope - heights[i] / steepness
             column, row = int(u), int(v)
             fu, fv = u - column, v - row
             blocked = np.float32(0)
