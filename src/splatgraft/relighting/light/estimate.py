@@ -54,8 +54,8 @@ _SUN = 0.03  # steradians; a smaller clipped patch may show the sun, whose rays 
 _LAMP = 0.64  # sine of the height above which a source in a room is named a lamp, otherwise a window
 _SEEN_NAMES = ("window", "lamp")  # low and high sources with a surface behind them
 _UNSEEN_NAMES = ("sun or window", "sun or lamp")  # low and high sources that no camera saw
-_ABOVE_HORIZON = (0.1, 0.4)  # sines of the heights at which walls end the view in a room
-_OPEN = 4.0  # distance there over that of the cameras, above which a place is out of doors; rooms have up to 3.1
+_AT_HORIZON, _ABOVE_HORIZON = (-0.1, 0.2), (0.1, 0.4)  # sines of heights; set by hand
+_OPEN = 1.2  # ratio of the distances seen there; rooms have up to 1.19, gardens and terraces 1.23 or more (log)
 _UNSEEN_RADIUS_DEG = 1.0  # angular radius of a source that no camera saw, beside the uncertainty of its direction
 
 # the view towards a source; set by hand
@@ -157,7 +157,7 @@ def estimate_light(
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
     if sun is None:
         known, name = direction_by_clock(captured.clock, main), BY_CLOCK
-        if known is None and main is not None and main.name in _UNSEEN_NAMES and _is_outdoors(evidence, cameras):
+        if known is None and main is not None and main.name in _UNSEEN_NAMES and _is_outdoors(evidence):
             known, name = (torch.tensor(main.direction), main.uncertainty_deg), "sun"
         if known is not None:
             shown = sun_near(*known, whole, region, name=name)
@@ -167,12 +167,14 @@ def estimate_light(
     return found if sun is None else found.with_sun(sun, scene)
 
 
-def _is_outdoors(evidence: LightEvidence, cameras: Cameras) -> bool:
-    """Whether what the cameras see a little above the horizon is far away, compared with their own distance."""
-    sine = DIRECTIONS @ evidence.up
-    seen = (sine > _ABOVE_HORIZON[0]) & (sine < _ABOVE_HORIZON[1]) & (evidence.far.seen > 0.5)
-    near = float((cameras.centers - evidence.surfaces.region.center).norm(dim=1).median())
-    return bool(seen.any()) and float(evidence.far.distance[seen].median()) > _OPEN * near
+def _is_outdoors(evidence: LightEvidence) -> bool:
+    """Whether what the cameras see above the horizon is farther away than at the horizon; a room's walls are not."""
+    sine, seen = DIRECTIONS @ evidence.up, evidence.far.seen > 0.5
+    at, above = (seen & (sine > low) & (sine < high) for low, high in (_AT_HORIZON, _ABOVE_HORIZON))
+    if not bool(at.any()) or not bool(above.any()):
+        return False
+    distance = evidence.far.distance
+    return float(distance[above].median()) > _OPEN * float(distance[at].median())
 
 
 def region_around(place: BoundingSphere, cameras: Cameras) -> BoundingSphere:
