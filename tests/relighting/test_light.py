@@ -24,7 +24,7 @@ from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.description import describe_light
-from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
+from splatgraft.relighting.light.estimate import EstimatedLight, _is_outdoors, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
 from splatgraft.relighting.light.known_sun import BY_CLOCK, direction_by_clock, sun_towards
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient, light_confidence
@@ -35,6 +35,7 @@ from splatgraft.relighting.light.panorama import (
     cube_directions,
     nearest_directions,
     render_panorama,
+    surroundings_at,
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.sun import (
@@ -483,6 +484,19 @@ def test_shadows_of_a_sun_that_exists_show_its_strength():
     assert degrees_apart(found.direction, sun) < 3
     assert found.ratio is not None
     assert found.ratio.tolist() == pytest.approx([3 * float(sun[2])] * 3, rel=0.25)
+
+
+@pytest.mark.parametrize(("near_height", "outdoors"), [(6.0, False), (0.8, True)])
+def test_a_room_ends_at_its_walls_and_a_garden_does_not(near_height, outdoors):
+    def wall(radius, height):
+        turns, z = torch.meshgrid(torch.linspace(0, 2 * math.pi, 200), torch.linspace(0, height, 60), indexing="ij")
+        around = torch.stack([turns.cos(), turns.sin(), torch.zeros_like(turns)], -1).reshape(-1, 3)
+        return surfels(radius * around + UP * z.reshape(-1, 1), -around, width=0.03 * radius)
+
+    scene = concatenate([wall(3.0, near_height), wall(15.0, 20.0)])
+    cameras = ring(height=0.5, radius=2.0, focal=50.0)
+    far = surroundings_at(scene, cameras, torch.tensor([0.0, 0.0, 0.3]), nearest=1.0)
+    assert _is_outdoors(far, UP) == outdoors
 
 
 def test_a_direction_by_the_clock_is_averaged_with_a_source_that_may_be_the_sun():

@@ -31,6 +31,7 @@ from splatgraft.relighting.light.panorama import (
     FARTHEST,
     SOLID_ANGLE,
     NoLight,
+    Surroundings,
     panorama_at,
     place_surroundings,
     surroundings_at,
@@ -157,7 +158,12 @@ def estimate_light(
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
     if sun is None:
         known, name = direction_by_clock(captured.clock, main), BY_CLOCK
-        if known is None and main is not None and main.name in _UNSEEN_NAMES and _is_outdoors(evidence):
+        if (
+            known is None
+            and main is not None
+            and main.name in _UNSEEN_NAMES
+            and _is_outdoors(evidence.far, captured.up)
+        ):
             known, name = (torch.tensor(main.direction), main.uncertainty_deg), "sun"
         if known is not None:
             shown = sun_near(*known, whole, region, name=name)
@@ -167,14 +173,11 @@ def estimate_light(
     return found if sun is None else found.with_sun(sun, scene)
 
 
-def _is_outdoors(evidence: LightEvidence) -> bool:
+def _is_outdoors(far: Surroundings, up: Float[Tensor, "3"]) -> bool:
     """Whether what the cameras see above the horizon is farther away than at the horizon; a room's walls are not."""
-    sine, seen = DIRECTIONS @ evidence.up, evidence.far.seen > 0.5
-    at, above = (seen & (sine > low) & (sine < high) for low, high in (_AT_HORIZON, _ABOVE_HORIZON))
-    if not bool(at.any()) or not bool(above.any()):
-        return False
-    distance = evidence.far.distance
-    return float(distance[above].median()) > _OPEN * float(distance[at].median())
+    sine, seen = DIRECTIONS @ up, far.seen > 0.5
+    at, above = (far.distance[seen & (sine > low) & (sine < high)] for low, high in (_AT_HORIZON, _ABOVE_HORIZON))
+    return len(at) > 0 and len(above) > 0 and float(above.median()) > _OPEN * float(at.median())
 
 
 def region_around(place: BoundingSphere, cameras: Cameras) -> BoundingSphere:
