@@ -167,7 +167,7 @@ def with_samples(function: Callable[..., Any], at: int, **values: float) -> Call
 
 
 SummedLight = tuple[Tensor, Tensor, Tensor]
-"""Irradiance without the object, with it, and by its bounce."""
+"""Irradiance on the receivers: without the object, with it, and the part that the object reflects."""
 
 
 def occluded(
@@ -537,6 +537,11 @@ ROWS: Mapping[str, Row] = {
         "sources", "direction of ambient light", {"relighting.light.estimate._ambient_of": even_ambient}
     ),
     "sun": Row("sun", "the sun from shadows", {"relighting.light.estimate.find_sun": lambda captured, region: None}),
+    "sun-outdoors": Row(
+        "sun",
+        "the brightest unseen source out of doors is the sun",
+        {"relighting.light.estimate._is_outdoors": lambda far, up: False},
+    ),
     "sun-strength": Row(
         "sun",
         "the sun's strength from shadow edges; that of the sources",

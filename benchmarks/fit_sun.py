@@ -80,7 +80,7 @@ def right_and_wrong(captured: CapturedScene, region: BoundingSphere, truth: Ligh
 
     The first is None without a strong source. Without a surface, the result is None.
     """
-    shown = next(iter(_ShadowEvidence.of(captured, region)), None)
+    shown = _ShadowEvidence.of(captured, region)
     if shown is None:
         return None
     directions = shown.above(_DIRECTIONS)

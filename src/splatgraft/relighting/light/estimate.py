@@ -3,9 +3,9 @@
 1. Collect the evidence: panorama, shading of surfaces, highlights.
 2. Find the radiance of 320 directions that explains it (`radiance_search.py`).
 3. Turn peaks of that radiance into sources, and the rest into ambient light of degree 2.
-4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it. Otherwise the clock of
-   the photos knows a sun; or the brightest source is one, if no camera saw it and the place is out of doors. It moves
-   to the shadows, and its strength is what they show, or what shading and a clear sky's prior give.
+4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it. Otherwise replace them by the
+   sun of the photos' clock. Without a clock, the brightest source is the sun out of doors, if no camera saw it. Both
+   move to the shadows and take the strength that these show, or that of `known_sun.py`.
 5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
 """
 
@@ -71,8 +71,8 @@ class EstimatedLight:
     mean: Light
     """Mean over the posterior."""
     sun: Sun | None
-    """Sun that replaces the distant sources of `mean`; None if neither shadows nor the clock nor, out of
-    doors, shading show one."""
+    """Sun that replaces the distant sources of `mean`, from shadows, the clock or, out of doors, shading; None without
+    one."""
     hidden: RadianceEstimate
     """Radiance that no camera recorded."""
     evidence: LightEvidence

@@ -76,8 +76,8 @@ _CLOCK_IS_WRONG = 0.05  # probability that no candidate of the clock is the sun
 _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
 _MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
 _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12  # angular radii that are tried, and directions that sample each
-_UNSEEN_RADIUS_DEG = 1.0  # angular radius of a sun set by hand if no edge of a shadow shows it
-_CLEAR = 3.0  # log likelihood, 20 to 1, above which a larger radius or the strength that shadows show is taken
+_UNSEEN_RADIUS_DEG = 1.0  # angular radius of a sun that no edge of a shadow shows
+_LIKELIER = 3.0  # difference of log likelihoods, 20 to 1, for a larger radius, and for the strength near a known sun
 _ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for others
 _BY_HAND_DEG, _BY_HAND_SPAN = 15.0, (30.0, 3.0)  # standard error of points set by hand; search around their direction
 _AROUND_SHADOW = 2.5  # region in which a sun set by hand is measured, in distances from a point to its shadow
@@ -167,7 +167,7 @@ class SurfacePicture:
 
 
 def find_surfaces(captured: CapturedScene, region: BoundingSphere, *, most: int = 1) -> list[Surface]:
-    """Find the level surfaces that the cameras see in a region, the one that shows most first, at most `most`."""
+    """Find up to `most` level surfaces that the cameras see in a region, the largest first."""
     seen = []
     for camera, drawn in captured.views:
         points = camera.unproject(drawn.depth[0])
@@ -322,13 +322,13 @@ class _ShadowEvidence:
     """Share of all other light that reaches the texels."""
 
     @staticmethod
-    def of(captured: CapturedScene, region: BoundingSphere, *, most: int = 1) -> "list[_ShadowEvidence]":
+    def on_surfaces(captured: CapturedScene, region: BoundingSphere, *, most: int) -> "list[_ShadowEvidence]":
         """Collect the evidence of level surfaces in a region, without those with too few texels or no occluders.
 
         Args:
             captured: The scene.
             region: Sphere that contains the surfaces and the occluders on them.
-            most: Maximum number of surfaces.
+            most: Maximum number of surfaces, the largest first.
         """
         found = []
         for surface in find_surfaces(captured, region, most=most):
@@ -336,6 +336,11 @@ class _ShadowEvidence:
             if len(standing.means) and int(picture.valid.sum()) >= _MIN_TEXELS:
                 found.append(_ShadowEvidence(picture, standing, surface.ambient(standing)))
         return found
+
+    @staticmethod
+    def of(captured: CapturedScene, region: BoundingSphere) -> "_ShadowEvidence | None":
+        """Collect the evidence of the largest level surface; None without one, with too few texels or no occluders."""
+        return next(iter(_ShadowEvidence.on_surfaces(captured, region, most=1)), None)
 
     @property
     def surface(self) -> Surface:
@@ -410,7 +415,7 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
 
 
 def _find_sun_within(captured: CapturedScene, region: BoundingSphere, decisive: float) -> Sun | None:
-    shown = next(iter(_ShadowEvidence.of(captured, region)), None)
+    shown = _ShadowEvidence.of(captured, region)
     if shown is None:
         return None
     direction, evidence, posterior = shown.best(shown.above(_DIRECTIONS), _prior_by_clock(captured.clock))
@@ -446,7 +451,7 @@ def sun_near(
         The sun in the mean direction, with the standard error of that. Its ratio is None if no surface clearly shows
         its shadow.
     """
-    surfaces = _ShadowEvidence.of(captured, replace(region, radius=_WIDER * region.radius), most=_SURFACES)
+    surfaces = _ShadowEvidence.on_surfaces(captured, replace(region, radius=_WIDER * region.radius), most=_SURFACES)
     near = _around(direction, 3 * error_deg, _STEP_DEG)
     near = near[near @ direction > math.cos(math.radians(3 * error_deg))]
     for one in surfaces:
@@ -461,8 +466,10 @@ def sun_near(
     variance = weights @ torch.rad2deg((near @ mean).clamp(-1, 1).acos()).square() / 2  # of two axes
     moved = replace(unmeasured, direction=mean, error_deg=max(float(variance.sqrt()), _ERROR_DEG))
     evidence, shown = max(((float(one.log_likelihoods(mean[None])), one) for one in surfaces), key=itemgetter(0))
+    if evidence < _LIKELIER:
+        return moved
     radius, ratio = _radius_and_ratio(shown, mean)
-    if evidence < _CLEAR or ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
+    if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
         return moved
     return replace(moved, radius_deg=radius, normal=shown.surface.plane.normal, ratio=ratio, evidence=evidence)
 
@@ -510,8 +517,7 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
     direction, spread_deg = direction_through(points, captured.up)
     pairs = torch.tensor(points).reshape(-1, 2, 3)
     for caster, shadow in pairs.unbind():
-        around = BoundingSphere(shadow, _AROUND_SHADOW * float((caster - shadow).norm()))
-        shown = next(iter(_ShadowEvidence.of(captured, around)), None)
+        shown = _ShadowEvidence.of(captured, BoundingSphere(shadow, _AROUND_SHADOW * float((caster - shadow).norm())))
         near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, *_BY_HAND_SPAN))
         if shown is None or not len(near):
             continue
@@ -561,7 +567,7 @@ def _radius_and_ratio(shown: _ShadowEvidence, direction: Float[Tensor, "3"]) -> 
     for _ in range(5):  # widths of the reconstruction's blur
         by_radius = torch.maximum(by_radius, fine.of_suns(blurred[:-1], blurred[-1], _FINE_STRENGTHS))
         blurred = _blurred(blurred)
-    radius = _RADII_DEG[int((by_radius > by_radius.max() - _CLEAR).int().argmax())]
+    radius = _RADII_DEG[int((by_radius > by_radius.max() - _LIKELIER).int().argmax())]
     return radius, lit_over_shaded(shown.picture, softened[0], shown.ambient)
 
 
