@@ -1,6 +1,7 @@
 """Flat Gaussians on surfaces of known geometry, and cameras around them, for tests in closed form."""
 
 import math
+from collections.abc import Callable
 from dataclasses import fields
 
 import torch
@@ -94,6 +95,21 @@ def camera_inside(width: int = 37, height: int = 29) -> Cameras:
 
 def sunlit_scene(sun: Tensor, strength: float) -> Gaussians:
     """Return balls on a floor of one material, lit by `sun` and an even sky; both of their shadows are exact."""
+    return _lit_scene(sun.expand_as, strength)
+
+
+def lamplit_scene(lamp: Tensor, strength: float) -> Gaussians:
+    """Return the balls and the floor of `sunlit_scene` under a lamp at a position; `strength` is that at the origin."""
+
+    def light_at(points: Tensor) -> Tensor:
+        towards = lamp - points
+        return float(lamp @ lamp) * towards / towards.norm(dim=1, keepdim=True) ** 3
+
+    return _lit_scene(light_at, strength)
+
+
+def _lit_scene(light_at: Callable[[Tensor], Tensor], strength: float) -> Gaussians:
+    """Return the scene under a light with this vector irradiance at points, over that of the sky times `strength`."""
     generator = torch.Generator().manual_seed(1)
     centers = torch.tensor([[1.0, 0.2, 0.25], [-0.6, 0.9, 0.25], [-0.7, -0.8, 0.25], [0.5, -1.1, 0.25]])
     grid = (torch.rand(12000, 2, generator=generator) - 0.5) * 5
@@ -104,10 +120,12 @@ def sunlit_scene(sun: Tensor, strength: float) -> Gaussians:
         points.append(center + 0.25 * around)
         normals.append(around)
     point, normal = torch.cat(points), torch.cat(normals)
-    lit = (normal @ sun).clamp_min(0)
+    light = light_at(point)
+    towards = torch.nn.functional.normalize(light, dim=1)
+    lit = (normal * light).sum(1).clamp_min(0)
     for center in centers:
         away = center - point - 1e-3 * normal
-        along = away @ sun
+        along = (away * towards).sum(1)
         hit = (along > 0) & ((away**2).sum(1) - along**2 < 0.25**2)
         lit = torch.where(hit & ((point - center).norm(dim=1) > 0.26), 0, lit)
     # a ball takes its form factor of the floor's sky

@@ -8,7 +8,7 @@ import gpu
 import pytest
 import torch
 
-QUICK = ("paper-adam", "lora")
+QUICK = ("lora",)
 TOY = gpu.Setting(torch.device("cpu"), toy=True)
 
 

@@ -3,11 +3,12 @@
 import math
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
-from shapes import UP, ring, sunlit_scene, surfels
+from shapes import UP, lamplit_scene, ring, sunlit_scene, surfels
 
 from splatgraft.cli import main
 from splatgraft.compositing.composite import PlacedObject
@@ -309,6 +310,22 @@ def estimated(scene, cameras=None) -> Light:
     return found.light
 
 
+SUN = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
+
+
+@cache
+def under_sun(strength: float) -> CapturedScene:
+    """The balls on their floor under `SUN`, of `strength` times the sky's light; captured once for all tests."""
+    return CapturedScene(sunlit_scene(SUN, strength), views())
+
+
+@cache
+def estimate_under_sun(strength: float) -> EstimatedLight:
+    found = estimate_light(under_sun(strength), BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3))
+    assert isinstance(found, EstimatedLight)
+    return found
+
+
 def main_direction(light):
     """Normal of the plane with the largest irradiance."""
     normals = even_directions(2000)
@@ -321,6 +338,7 @@ def test_shadows_give_the_direction_of_a_sun_that_no_camera_saw(azimuth):
     light = estimated(sunlit_scene(sun, strength=3.0))
     # edges of shadows are off by at most three texels, and a ball is about fifteen texels high
     assert degrees_apart(torch.tensor(light.sources[0].direction), sun) < 3
+    assert math.isinf(light.sources[0].distance)
     # the shadows show 3 cos of the sky's light; the estimate is too low: Gaussians mix lit and shaded floor at edges
     on_floor = light.irradiance(UP[None]).mean()
     share = sum(light.sources[0].irradiance) / 3 * light.sources[0].direction[2] / on_floor
@@ -343,16 +361,15 @@ def sun_of(scene):
 
 
 def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s_edge_shows():
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
-    scene, tops = sunlit_scene(sun, 3.0), torch.tensor([[1.0, 0.2, 0.5], [-0.6, 0.9, 0.5]])
+    scene, tops = under_sun(3.0).gaussians, torch.tensor([[1.0, 0.2, 0.5], [-0.6, 0.9, 0.5]])
     # the casters are marked slightly off
     off = torch.tensor([0.02, -0.01, 0.0])
-    points = [tuple(at.tolist()) for top in tops for at in (top + off, top - sun * top[2] / sun[2])]
+    points = [tuple(at.tolist()) for top in tops for at in (top + off, top - SUN * top[2] / SUN[2])]
     found = set_sun(points, CapturedScene(scene, views()))
-    assert degrees_apart(found.direction, sun) < 3
+    assert degrees_apart(found.direction, SUN) < 3
     assert found.name == SET_BY_HAND
     assert found.ratio is not None
-    assert found.ratio.tolist() == pytest.approx([3 * float(sun[2])] * 3, rel=0.25)
+    assert found.ratio.tolist() == pytest.approx([3 * float(SUN[2])] * 3, rel=0.25)
     light = with_sun(Light((), fit_ambient(torch.ones(3))), found)
     # the sun and the rest share the irradiance on the floor as measured
     assert light.irradiance(UP[None])[0].tolist() == pytest.approx([math.pi] * 3, rel=0.02)
@@ -384,17 +401,16 @@ def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s
     "around", [0, pytest.param(3, marks=pytest.mark.long), pytest.param(slice(None), marks=pytest.mark.long)]
 )
 def test_points_that_are_degrees_off_give_the_sun_of_the_shadow_beside_them(off_deg, around):
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
-    captured, top = CapturedScene(sunlit_scene(sun, 3.0), views()), torch.tensor([1.0, 0.2, 0.5])
-    shadow = top - sun * top[2] / sun[2]
-    right, down = tangents(sun)
+    captured, top = under_sun(3.0), torch.tensor([1.0, 0.2, 0.5])
+    shadow = top - SUN * top[2] / SUN[2]
+    right, down = tangents(SUN)
     for angle in torch.arange(8)[around].reshape(-1) * (math.pi / 4):
         away = math.tan(math.radians(off_deg)) * (angle.cos() * right + angle.sin() * down)
-        caster = shadow + torch.nn.functional.normalize(sun + away, dim=0) * (top - shadow).norm()
+        caster = shadow + torch.nn.functional.normalize(SUN + away, dim=0) * (top - shadow).norm()
         found = set_sun([(*caster.tolist(),), (*shadow.tolist(),)], captured)
-        assert degrees_apart(found.direction, sun) < 3
+        assert degrees_apart(found.direction, SUN) < 3
         assert found.ratio is not None
-        assert found.ratio.tolist() == pytest.approx([3 * float(sun[2])] * 3, rel=0.25)
+        assert found.ratio.tolist() == pytest.approx([3 * float(SUN[2])] * 3, rel=0.25)
 
 
 def clock_at(*directions, error_deg=5.0):
@@ -406,8 +422,7 @@ def clock_at(*directions, error_deg=5.0):
 
 @pytest.mark.long
 def test_a_clock_decides_between_shadows_and_does_not_overrule_clear_ones():
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
-    scene, region = sunlit_scene(sun, 3.0), BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 2.4)
+    scene, region = under_sun(3.0).gaussians, BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 2.4)
     near, far = (
         torch.nn.functional.normalize(torch.tensor(one), dim=0) for one in ([0.5, -0.7, 0.5], [-0.6, 0.5, 0.5])
     )
@@ -420,7 +435,7 @@ def test_a_clock_decides_between_shadows_and_does_not_overrule_clear_ones():
     assert by_wrong_clock is not None
     for found in (by_clock, by_wrong_clock):
         # the shadows are clear
-        assert degrees_apart(found.direction, sun) < 3
+        assert degrees_apart(found.direction, SUN) < 3
         # the evidence is that of the shadows alone, of which the search without a clock finds the largest
         assert found.evidence < alone.evidence + 0.1
     # among directions that the shadows show almost as well, one nearer to the clock's is taken
@@ -429,44 +444,56 @@ def test_a_clock_decides_between_shadows_and_does_not_overrule_clear_ones():
 
 @pytest.mark.long
 def test_beside_a_clock_that_agrees_fainter_shadows_show_the_sun():
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     noise = torch.randn(20000, generator=torch.Generator().manual_seed(3))
-    scene = sunlit_scene(sun, 3.0)
+    scene = under_sun(3.0).gaussians
     scene = painted(scene, lambda means: noise[: len(means)].exp())
     # one shadow, cut off by the region's edge, on a floor whose texels differ by a factor of e
     region = BoundingSphere(torch.tensor([1.8, 0.0, 0.3]), 0.8)
     wrong = torch.nn.functional.normalize(torch.tensor([-0.6, 0.5, 0.5]), dim=0)
     found = [_find_sun_within(CapturedScene(scene, views(), clock), region, 40.0) for clock in (None, clock_at(wrong))]
     assert found == [None, None]
-    by_clock = _find_sun_within(CapturedScene(scene, views(), clock_at(sun)), region, 40.0)
+    by_clock = _find_sun_within(CapturedScene(scene, views(), clock_at(SUN)), region, 40.0)
     assert by_clock is not None
-    assert degrees_apart(by_clock.direction, sun) < 12
+    assert degrees_apart(by_clock.direction, SUN) < 12
     assert 10 < by_clock.evidence < 40
 
 
 @pytest.mark.parametrize("place", [(1.5, -1.5, 0.05), pytest.param((-1.8, -1.6, 0.05), marks=pytest.mark.long)])
 def test_shadows_far_from_a_small_object_show_the_sun(place):
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     small = BoundingSphere(torch.tensor(place), 0.06)
-    found = estimate_light(CapturedScene(sunlit_scene(sun, 3.0), views()), small)
+    found = estimate_light(under_sun(3.0), small)
     assert isinstance(found, EstimatedLight)
     assert found.sun is not None
-    assert degrees_apart(found.sun.direction, sun) < 3
+    assert degrees_apart(found.sun.direction, SUN) < 3
+
+
+@pytest.mark.parametrize("lamp", [(2.0, -2.0, 3.0), pytest.param((-1.0, 2.5, 5.0), marks=pytest.mark.long)])
+def test_a_near_lamp_is_where_its_shadows_meet(lamp):
+    place = torch.tensor([0.0, 0.0, 0.3])
+    towards = torch.tensor(lamp) - place
+    scene = lamplit_scene(torch.tensor(lamp), 2.0)
+    found = find_sun(CapturedScene(scene, views()), BoundingSphere(place, 2.4))
+    assert found is not None
+    # as a sun it is 17 and 9 degrees off
+    assert degrees_apart(found.direction, torch.nn.functional.normalize(towards, dim=0)) < 3
+    assert 0.5 < found.distance / float(towards.norm()) < 2
+    source = estimate_under_sun(3.0).with_sun(found, scene).light.sources[0]
+    assert source.name == "lamp"
+    assert source.blockers_within < source.distance == found.distance
 
 
 def test_shadows_that_prove_no_sun_move_one_that_exists():
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     noise = torch.randn(20000, generator=torch.Generator().manual_seed(3))
-    scene = painted(sunlit_scene(sun, 3.0), lambda means: noise[: len(means)].exp())
+    scene = painted(under_sun(3.0).gaussians, lambda means: noise[: len(means)].exp())
     captured = CapturedScene(scene, views())
     # in the wider region lie the balls and their shadows, on a floor whose texels differ by a factor of e
     region = BoundingSphere(torch.tensor([1.8, 0.0, 0.3]), 0.8)
     assert _find_sun_within(captured, region, 40.0) is None
-    right, down = tangents(sun)
+    right, down = tangents(SUN)
     for aside in (right, -down):
-        estimated = torch.nn.functional.normalize(sun + math.tan(math.radians(12.0)) * aside, dim=0)
+        estimated = torch.nn.functional.normalize(SUN + math.tan(math.radians(12.0)) * aside, dim=0)
         moved = sun_near(estimated, 8.0, captured, region)
-        assert degrees_apart(moved.direction, sun) < 3
+        assert degrees_apart(moved.direction, SUN) < 3
         assert moved.error_deg < 4
     # without shadows nothing changes
     away = sun_near(estimated, 8.0, captured, BoundingSphere(torch.tensor([20.0, 0.0, 0.3]), 0.3))
@@ -476,14 +503,11 @@ def test_shadows_that_prove_no_sun_move_one_that_exists():
 
 
 def test_shadows_of_a_sun_that_exists_show_its_strength():
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
-    estimated = torch.nn.functional.normalize(sun + math.tan(math.radians(12.0)) * tangents(sun)[0], dim=0)
-    found = sun_near(
-        estimated, 8.0, CapturedScene(sunlit_scene(sun, 3.0), views()), BoundingSphere(torch.zeros(3), 0.8)
-    )
-    assert degrees_apart(found.direction, sun) < 3
+    estimated = torch.nn.functional.normalize(SUN + math.tan(math.radians(12.0)) * tangents(SUN)[0], dim=0)
+    found = sun_near(estimated, 8.0, under_sun(3.0), BoundingSphere(torch.zeros(3), 0.8))
+    assert degrees_apart(found.direction, SUN) < 3
     assert found.ratio is not None
-    assert found.ratio.tolist() == pytest.approx([3 * float(sun[2])] * 3, rel=0.25)
+    assert found.ratio.tolist() == pytest.approx([3 * float(SUN[2])] * 3, rel=0.25)
 
 
 @pytest.mark.parametrize(("near_height", "outdoors"), [(6.0, False), (0.8, True)])
@@ -500,47 +524,43 @@ def test_a_room_ends_at_its_walls_and_a_garden_does_not(near_height, outdoors):
 
 
 def test_a_direction_by_the_clock_is_averaged_with_a_source_that_may_be_the_sun():
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     assert direction_by_clock(None, None) is None
-    alone = direction_by_clock(clock_at(sun), None)
+    alone = direction_by_clock(clock_at(SUN), None)
     assert alone is not None
-    assert torch.equal(alone[0], sun)
+    assert torch.equal(alone[0], SUN)
     assert alone[1] == 5.0
     # a source 8 degrees away with the same error may be the sun: the mean is half as far
-    off = torch.nn.functional.normalize(sun + 0.14 * torch.linalg.cross(sun, UP), dim=0).tolist()
+    off = torch.nn.functional.normalize(SUN + 0.14 * torch.linalg.cross(SUN, UP), dim=0).tolist()
     near = LightSource((off[0], off[1], off[2]), (1.0, 1.0, 1.0), uncertainty_deg=5.0)
-    joined = direction_by_clock(clock_at(sun), near)
+    joined = direction_by_clock(clock_at(SUN), near)
     assert joined is not None
-    assert degrees_apart(joined[0], sun) == pytest.approx(degrees_apart(torch.tensor(off), sun) / 2, rel=0.01)
+    assert degrees_apart(joined[0], SUN) == pytest.approx(degrees_apart(torch.tensor(off), SUN) / 2, rel=0.01)
 
 
 def test_shading_and_highlights_show_how_strong_a_sun_in_a_known_direction_is():
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
-    place, found = BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3), {}
+    found = {}
     for strength in (0.0, 3.0):
-        estimate = estimate_light(CapturedScene(sunlit_scene(sun, strength), views()), place)
-        assert isinstance(estimate, EstimatedLight)
+        estimate = estimate_under_sun(strength)
         problem = radiance_problem(estimate.evidence)
-        unmeasured = Sun(sun, 1.0, UP, None, 0.0, 5.0, BY_CLOCK)
+        unmeasured = Sun(SUN, 1.0, UP, None, 0.0, 5.0, BY_CLOCK)
         found[strength] = sun_towards(unmeasured, problem, estimate.evidence, estimate.rest())
     bright, hidden = found[3.0], found[0.0]
     assert bright is not None
     assert bright.name == BY_CLOCK
-    assert torch.allclose(bright.direction, sun)
+    assert torch.allclose(bright.direction, SUN)
     assert bright.error_deg == 5.0
     # 3 times the sine of the height is 1.6. Shading alone leaves a factor open: the estimate's even light holds a part
-    assert 0.2 < float(bright.ratio @ LUMINANCE) / (3 * float(sun[2])) < 4
+    assert 0.2 < float(bright.ratio @ LUMINANCE) / (3 * float(SUN[2])) < 4
     # under an even sky the sun is hidden, or at least weak
     assert hidden is None or float(hidden.ratio @ LUMINANCE) < 0.3 * float(bright.ratio @ LUMINANCE)
 
 
 @pytest.mark.long
 def test_shadows_show_the_sun_on_a_floor_of_two_materials():
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
-    checked = painted(sunlit_scene(sun, 3.0), lambda at: 0.5 + 0.5 * ((at[:, :2] * 1.2).floor().sum(1) % 2))
+    checked = painted(under_sun(3.0).gaussians, lambda at: 0.5 + 0.5 * ((at[:, :2] * 1.2).floor().sum(1) % 2))
     found = sun_of(checked)
     assert found is not None
-    assert degrees_apart(found.direction, sun) < 3
+    assert degrees_apart(found.direction, SUN) < 3
 
 
 @pytest.mark.parametrize(
@@ -551,20 +571,21 @@ def test_shadows_show_the_sun_on_a_floor_of_two_materials():
     ],
 )
 def test_neither_even_light_nor_stripes_make_a_sun(gray):
-    assert sun_of(painted(sunlit_scene(UP, 0.0), gray)) is None
+    assert sun_of(painted(under_sun(0.0).gaussians, gray)) is None
 
 
 @pytest.mark.long
 def test_bars_of_sunlight_beside_what_nothing_explains_do_not_turn_the_sun():
-    sun = torch.nn.functional.normalize(torch.tensor([0.5, -0.6, 0.5]), dim=0)
     # a window's frame that no camera saw shades a third of the floor
-    found = sun_of(painted(sunlit_scene(sun, 3.0), lambda at: torch.where((at[:, 0] + at[:, 1]).abs() < 0.3, 0.4, 1.0)))
+    found = sun_of(
+        painted(under_sun(3.0).gaussians, lambda at: torch.where((at[:, 0] + at[:, 1]).abs() < 0.3, 0.4, 1.0))
+    )
     assert found is not None
-    assert degrees_apart(found.direction, sun) < 3
+    assert degrees_apart(found.direction, SUN) < 3
 
 
 def test_an_even_sky_gives_an_even_light():
-    light = estimated(sunlit_scene(UP, strength=0.0))
+    light = estimate_under_sun(0.0).light
     up, side = light.irradiance(torch.tensor([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])).mean(1)
     # the ground takes half of the sky from a wall
     assert float(up / side) < 3
@@ -600,14 +621,13 @@ def test_what_no_camera_saw_is_white_whatever_the_colour_of_what_stands_around()
     assert max(r, g, b) < 1.1 * min(r, g, b)
 
 
-@pytest.mark.parametrize(
-    ("height", "name"), [pytest.param(0.15, "sun or window", marks=pytest.mark.long), (0.6, "sun or lamp")]
-)
-def test_what_shadows_alone_show_is_named_by_where_it_may_be(height, name):
-    sun = torch.nn.functional.normalize(torch.tensor([0.3, 0.3, height]), dim=0)
-    light = estimated(sunlit_scene(sun, strength=3.0), views((0.0, 1.5)))
-    assert light.sources[0].name == name
-    assert f"{name} " in describe_light(light, UP)
+def test_what_shadows_alone_show_is_named_by_where_it_may_be():
+    light = estimate_under_sun(3.0).light
+    assert light.sources[0].name == "sun or window"
+    assert "sun or window " in describe_light(light, UP)
+    # a window is never overhead
+    high = Sun(torch.nn.functional.normalize(torch.tensor([0.3, 0.3, 0.6]), dim=0), 1.0, UP, None, 50.0)
+    assert estimate_under_sun(3.0).with_sun(high, under_sun(3.0).gaussians).light.sources[0].name == "sun or lamp"
 
 
 @pytest.mark.parametrize(("uncertainty_deg", "is_doubted"), [(14.0, False), (17.0, True)])

@@ -94,7 +94,7 @@ class EstimatedLight:
 
         The surface of `scene` at which the view towards the sun ends, such as a window's pane, does not block it.
         """
-        named = replace(sun, name=sun.name or self._name_at(sun.direction))
+        named = replace(sun, name=sun.name or ("lamp" if math.isfinite(sun.distance) else self._name_at(sun.direction)))
         placed = with_blocker_distances(with_sun(self.mean, named), scene, self.place)
         return replace(self, sun=replace(named, blockers_within=placed.sources[0].blockers_within))
 
@@ -272,6 +272,6 @@ def with_blocker_distances(light: Light, scene: Gaussians, place: BoundingSphere
         pose = look_at(place.center[None], place.center + direction, up)
         rendered = render(scene, pinhole(pose, 32.0, width=16, height=16), outputs=frozenset({"depth"}))
         visible = rendered.depth > place.radius
-        distance = float(rendered.depth[visible].quantile(_SOURCE_QUANTILE)) if bool(visible.any()) else math.inf
-        sources.append(replace(source, blockers_within=_BLOCKERS_WITHIN * distance))
+        seen = float(rendered.depth[visible].quantile(_SOURCE_QUANTILE)) if bool(visible.any()) else math.inf
+        sources.append(replace(source, blockers_within=_BLOCKERS_WITHIN * min(seen, source.distance)))
     return replace(light, sources=tuple(sources))

@@ -11,7 +11,8 @@
 4. Add the log density of the direction by the clock of the photos, if there is one: where the sun must be is known, so
    that fainter shadows show it.
 5. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
-6. If no direction is decisively better than no sun, do the same in a wider region.
+6. Compare the sun with lamps at a few heights, whose shadows diverge.
+7. If no direction is decisively better than no sun, do the same in a wider region.
 
 If no shadow is decisive, but shading or the clock of the photos shows a sun, `sun_near` moves it to the shadows of
 several surfaces.
@@ -66,10 +67,11 @@ _STRENGTHS = (1.0, 3.0, 9.0)  # irradiance of the sun over that of all other lig
 _FINE_STRENGTHS = (0.5, 1.0, 1.8, 3.0, 5.0, 10.0)
 _APART = math.cos(math.radians(8.0))  # cosine of the minimum angle between two maxima
 _SPANS = ((3.0, 1.0), (1.0, 0.33))  # half width and step of the grids around a maximum, degrees
+_LAMP_HEIGHTS, _LAMP_SPAN_DEG = (4.0, 2.0), 10.0  # half widths of the surface; search around the sun's direction
 _PROMISING = 10.0  # log likelihood over that of even light above which a direction of the search is refined
 _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
 _SURFACES = 2  # level surfaces whose shadows move a sun: a table, and the ground around it
-_STEP_DEG = 2.5  # of the grid of directions around a sun that is known to exist
+_STEP_DEG = 2.5  # of the grids of directions around a given one
 _WIDER = 3.0  # radius of the second region: few things stand near a small object, but the sun is the same
 _TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a prior, because texels share their errors
 _CLOCK_IS_WRONG = 0.05  # probability that no candidate of the clock is the sun
@@ -79,7 +81,8 @@ _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12  # angular radii that are trie
 _UNSEEN_RADIUS_DEG = 1.0  # angular radius of a sun that no edge of a shadow shows
 _LIKELIER = 3.0  # difference of log likelihoods, 20 to 1, for a larger radius, and for the strength near a known sun
 _ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for others
-_BY_HAND_DEG, _BY_HAND_SPAN = 15.0, (30.0, 3.0)  # standard error of points set by hand; search around their direction
+_BY_HAND_DEG, _BY_HAND_SPAN_DEG = 15.0, 30.0  # standard error of points set by hand; search around their direction
+_BELOW_LAMP = 0.9  # of a lamp's height; what stands higher blocks as if it stood there
 _AROUND_SHADOW = 2.5  # region in which a sun set by hand is measured, in distances from a point to its shadow
 
 SET_BY_HAND = "sun set by hand"
@@ -112,6 +115,8 @@ class Sun:
     """Name in reports, as in `LightSource`; empty for a sun that was found."""
     blockers_within: float = math.inf
     """Maximum distance of occluders that block the sun, world units."""
+    distance: float = math.inf
+    """Distance from the place, world units; finite for a lamp, whose shadows diverge."""
 
 
 @dataclass(frozen=True)
@@ -320,6 +325,8 @@ class _ShadowEvidence:
     """Gaussians above the surface."""
     ambient: Float[Tensor, "s s"]
     """Share of all other light that reaches the texels."""
+    lamp_height: float = math.inf
+    """Height above the surface, world units, of the lamp whose shadows are compared; infinite for the sun."""
 
     @staticmethod
     def on_surfaces(captured: CapturedScene, region: BoundingSphere, *, most: int) -> "list[_ShadowEvidence]":
@@ -345,6 +352,22 @@ class _ShadowEvidence:
     @property
     def surface(self) -> Surface:
         return self.picture.surface
+
+    def of_lamp(self, direction: Float[Tensor, "3"], height: float) -> "_ShadowEvidence":
+        """Move the occluders so that the shadows of parallel light become those of a lamp.
+
+        The shadows hold for directions near `direction`, each for a lamp in that direction from the surface's centre.
+
+        Args:
+            direction: Unit, from the surface's centre towards the lamp.
+            height: Height of the lamp above the surface, world units.
+        """
+        normal, center = self.surface.plane.normal, self.surface.center
+        away = height / float(direction @ normal) * direction - height * normal  # from the centre to the lamp's foot
+        h = self.surface.plane.height(self.standing.means)[:, None].clamp_max(_BELOW_LAMP * height)
+        foot = self.standing.means - h * normal
+        moved = self.standing.means + (foot - center - away) * h / (height - h) + away * h / height
+        return replace(self, standing=replace(self.standing, means=moved), lamp_height=height)
 
     def above(self, directions: Float[Tensor, "k 3"]) -> Float[Tensor, "m 3"]:
         """Select the directions above the surface."""
@@ -421,10 +444,29 @@ def _find_sun_within(captured: CapturedScene, region: BoundingSphere, decisive: 
     direction, evidence, posterior = shown.best(shown.above(_DIRECTIONS), _prior_by_clock(captured.clock))
     if evidence < _PROMISING or posterior < decisive:
         return None
+    shown, direction, evidence = _lamp_or_sun(shown, direction, evidence)
     radius, ratio = _radius_and_ratio(shown, direction)
     if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
         return None
-    return Sun(direction, radius, shown.surface.plane.normal, ratio, evidence)
+    normal, center = shown.surface.plane.normal, shown.surface.center
+    sun = Sun(direction, radius, normal, ratio, evidence)
+    if math.isinf(shown.lamp_height):
+        return sun
+    towards = center + shown.lamp_height / float(direction @ normal) * direction - region.center
+    return replace(sun, direction=F.normalize(towards, dim=0), distance=float(towards.norm()))
+
+
+def _lamp_or_sun(
+    sun: _ShadowEvidence, direction: Float[Tensor, "3"], evidence: float
+) -> tuple[_ShadowEvidence, Float[Tensor, "3"], float]:
+    """Return shadows, direction and log likelihood of the likeliest lamp near a sun; the sun's if none is likelier."""
+    near = sun.above(_around(direction, _LAMP_SPAN_DEG, _STEP_DEG))
+    lamps = [sun.of_lamp(direction, height * sun.surface.half) for height in _LAMP_HEIGHTS]
+    likelihoods = [float(one.log_likelihoods(near).max()) for one in (sun, *lamps)]
+    lamp = max(zip(likelihoods[1:], lamps, strict=True), key=itemgetter(0))
+    if lamp[0] < likelihoods[0] + _PROMISING:
+        return sun, direction, evidence
+    return lamp[1], *lamp[1].best(near, _prior_by_clock(None))[:2]
 
 
 def sun_near(
@@ -518,7 +560,7 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
     pairs = torch.tensor(points).reshape(-1, 2, 3)
     for caster, shadow in pairs.unbind():
         shown = _ShadowEvidence.of(captured, BoundingSphere(shadow, _AROUND_SHADOW * float((caster - shadow).norm())))
-        near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, *_BY_HAND_SPAN))
+        near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, _BY_HAND_SPAN_DEG, _STEP_DEG))
         if shown is None or not len(near):
             continue
         found, evidence, _ = shown.best(near, _prior_near(direction[None], _BY_HAND_DEG, wrong=0.0))
@@ -645,5 +687,6 @@ def with_sun(light: Light, sun: Sun) -> Light:
         sun.error_deg,
         name=sun.name,
         blockers_within=sun.blockers_within,
+        distance=sun.distance,
     )
     return replace(others, sources=(found, *dimmed), ambient=scale * others.ambient)
