@@ -155,13 +155,13 @@ def past_object(
 def with_samples(function: Callable[..., Any], at: int, **values: float) -> Callable[..., Any]:
     """Set fields of the light samples, which are the argument at position `at`, to one value for all samples."""
 
-    def call(*args: Any) -> Any:
+    def call(*args: Any, **more: Any) -> Any:
         samples = args[at]
         changes = {
             name: (value,) * len(samples) if name == "blockers_within" else torch.full((len(samples),), value)
             for name, value in values.items()
         }
-        return function(*args[:at], replace(samples, **changes), *args[at + 1 :])
+        return function(*args[:at], replace(samples, **changes), *args[at + 1 :], **more)
 
     return call
 

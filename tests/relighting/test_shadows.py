@@ -140,6 +140,27 @@ def test_the_scene_s_own_shadow_stands_where_low_light_puts_it_on_a_rough_layer(
     assert float(visible[on_floor & (aside > 0.44)].mean()) > 0.97
 
 
+def test_a_shadow_falls_past_a_table_onto_a_floor_far_below():
+    # 22 radii below; the table's own shadow already covers a part of the ball's there
+    depth, half = 6.0, 0.4
+    away = torch.tensor([-depth, 0.0, -depth])
+    below = floor(half=1.5)
+    scene = concatenate([floor(half=half, count=60), replace(below, means=below.means + away)])
+    light = from_above(x=1.0, angular_radius_deg=0.27, ambient=fit_ambient(torch.full((3,), 0.1)))
+    lost, points = lost_light(relit_ball(light, target=scene))
+    on_floor = points[:, 2] < -1
+    x, y, _ = (points[on_floor] - away).unbind(1)
+    lost = lost[on_floor]
+    # the rays that touch the ball meet the floor in an ellipse, those that touch the table in its own square
+    ellipse = (((x + CENTER[2]) / math.sqrt(2)) ** 2 + y**2).sqrt() / RADIUS
+    square = torch.maximum(x.abs(), y.abs()) / half
+    # penumbras are .08 wide, 2 * .27 degrees times 8.5, so they lie within 15% of the ball's radius around its outline
+    by_sun = 3.0 / math.sqrt(2) / (3.0 / math.sqrt(2) + 0.1 * math.pi)
+    assert float(lost[(ellipse < 0.8) & (square > 1.15)].min()) > 0.95 * by_sun
+    assert float(lost[(ellipse < 0.8) & (square < 0.85)].mean()) < 0.05 * by_sun
+    assert float(lost[ellipse > 1.2].max()) < 0.05 * by_sun
+
+
 def test_the_bounce_is_no_brighter_than_the_new_light_allows():
     # an object that was overexposed in its capture
     dim = from_above(irradiance=0.05, ambient=fit_ambient(torch.full((3,), 0.02)))

@@ -105,7 +105,8 @@ def find_scene_light(
     else:
         light = with_blocker_distances(light, scene, place)
     samples = sample_light(light)
-    maps = scene_shadow_maps(scene, BoundingSphere(place.center, _MARGIN * (place.radius * reach)), samples)
+    region = BoundingSphere(place.center, _MARGIN * (place.radius * reach))
+    maps = scene_shadow_maps(scene, region, samples, radius=place.radius)
     receivers = _receivers(captured, spheres, light, maps)
     return SceneLight(captured, light, estimate, samples, maps, receivers, tuple(spheres), reach)
 
@@ -125,7 +126,7 @@ def _receivers(
     rims = RIM * scene.scales.max(1).values
     for sphere in spheres:
         reached |= reachable(scene.means, sphere, samples, farthest=region.radius, rims=rims + sphere.radius)
-    indices = (reached & ((scene.means - region.center).norm(dim=1) < region.radius)).nonzero()[:, 0]
+    indices = (reached & maps.covers(scene.means)).nonzero()[:, 0]
     gaussians = scene.select(indices)
     normals = captured.normals.vectors[indices]
     return Receivers(

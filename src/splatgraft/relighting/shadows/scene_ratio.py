@@ -122,12 +122,37 @@ class SceneShadowMaps:
     ambient_maps: DepthMaps
     """Depth maps, one per ambient sample."""
 
+    def covers(self, points: Float[Tensor, "m 3"]) -> Bool[Tensor, "m"]:
+        """Select points in the region, or behind it as seen from a source, where that source's map shows them, too."""
+        away = points - self.region.center
+        found = away.norm(dim=1) < self.region.radius
+        if self.source_maps is not None:
+            for direction in self.source_maps.window.directions:
+                found |= torch.linalg.cross(away, direction.expand_as(away)).norm(dim=1) < self.region.radius
+        return found
 
-def scene_shadow_maps(scene: Gaussians, region: BoundingSphere, samples: LightSamples) -> SceneShadowMaps:
-    """Splat depth maps of `scene` for every light sample; only Gaussians in or near `region` block light."""
+
+def scene_shadow_maps(
+    scene: Gaussians, region: BoundingSphere, samples: LightSamples, *, radius: float
+) -> SceneShadowMaps:
+    """Splat depth maps of a scene for every light sample.
+
+    Args:
+        scene: Only Gaussians near the region, and those behind it where umbras reach them, block light.
+        region: The sphere that the maps cover.
+        samples: Samples of the light.
+        radius: Radius of the largest object, world units.
+    """
     maps: list[DepthMaps | None] = []
     reach = 1.5 * region.radius + 3 * scene.scales.max(1).values
-    blockers = scene.select((scene.means - region.center).norm(dim=1) < reach)
+    away = scene.means - region.center
+    near = away.norm(dim=1) < reach
+    sources = samples.of_sources
+    for direction, length in zip(sources.directions, umbra_lengths(sources, radius), strict=True):
+        along = -(away @ direction)
+        aside = torch.linalg.cross(away, direction.expand_as(away)).norm(dim=1)
+        near |= (along > 0) & (along < length) & (aside < reach)
+    blockers = scene.select(near)
     sizes = (_SOURCE_SIZE, _AMBIENT_SIZE)
     for part, size in zip((samples.of_sources, samples.of_ambient), sizes, strict=True):
         window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
@@ -275,19 +300,35 @@ def reachable(
         points: World units.
         sphere: The object's bounding sphere.
         samples: Samples of the light.
-        farthest: World units from the object; no point beyond is reached.
+        farthest: World units from the object; a cone ends there, or at the end of its umbra (`umbra_lengths`).
         rims: Extent of the Gaussian around each point, world units.
     """
     away = points - sphere.center
     distance = away.norm(dim=1)
-    near = distance - rims < 3.5 * sphere.radius  # reach of ambient shadow and bounce; set by hand
-    parts = zip(samples.directions, samples.softness, samples.is_source, samples.distances, strict=True)
-    for direction, softness, source, light_distance in parts:
-        if source:
-            along = -(away @ direction)
-            aside = (distance**2 - along**2).clamp_min(0).sqrt()
-            spread = torch.tan(softness.clamp_max(1.2)) * (along + sphere.radius).clamp_min(0)
-            # the shadow of a near light widens with the distance
-            wider = 1 + along.clamp_min(0) / (light_distance - sphere.radius).clamp_min(0.5 * sphere.radius)
-            near |= (along + rims > -sphere.radius) & (aside - rims < wider * (sphere.radius + spread))
-    return near & (distance - rims < farthest)
+    inside = distance - rims < farthest
+    reached = inside & (distance - rims < 3.5 * sphere.radius)  # reach of ambient shadow and bounce; set by hand
+    sources = samples.of_sources
+    parts = zip(
+        sources.directions, sources.softness, sources.distances, umbra_lengths(sources, sphere.radius), strict=True
+    )
+    for direction, softness, light_distance, length in parts:
+        along = -(away @ direction)
+        aside = (distance**2 - along**2).clamp_min(0).sqrt()
+        spread = torch.tan(softness.clamp_max(1.2)) * (along + sphere.radius).clamp_min(0)
+        # the shadow of a near light widens with the distance
+        wider = 1 + along.clamp_min(0) / (light_distance - sphere.radius).clamp_min(0.5 * sphere.radius)
+        in_cone = (along + rims > -sphere.radius) & (aside - rims < wider * (sphere.radius + spread))
+        reached |= in_cone & (inside | (along - rims < length))
+    return reached
+
+
+def umbra_lengths(sources: LightSamples, radius: float) -> Float[Tensor, "k"]:
+    """Compute the lengths of the umbras of a ball, world units; no shadow behind one is full. 0 for near lights.
+
+    Args:
+        sources: k samples of sources.
+        radius: The ball's radius, world units.
+    """
+    narrowest = math.radians(0.27)  # of the sun
+    lengths = radius / torch.tan(sources.softness.clamp(narrowest, 1.2))
+    return torch.where(torch.isinf(sources.distances), lengths, 0.0)
