@@ -57,9 +57,7 @@ class ReflectedLight:
             directions: Unit, away from the surface.
             concentration: Concentration of the lobes: one over the square of their width in radians.
         """
-        first = 1 / math.tanh(concentration) - 1 / concentration
-        bands = torch.tensor([1.0] + [first] * 3 + [1 - 3 * first / concentration] * 5)
-        total = (spherical_harmonics.basis(directions, 2) @ (bands[:, None] * self.ambient)).clamp_min(0)
+        total = self.ambient_radiance(directions, concentration)
         for i in range(len(self.directions)):
             # variances per axis add: r^2 / 4 for a cone of radius r, and 1 / concentration for a lobe
             k = 1 / (1 / concentration + 0.25 * float(self.softness[i]) ** 2)
@@ -67,6 +65,42 @@ class ReflectedLight:
             lobe = peak * torch.exp(k * (directions @ self.directions[i] - 1)) * self.visibility[:, i : i + 1]
             total = total + lobe[..., None] * self.irradiance[i]
         return total
+
+    def ambient_radiance(self, directions: Float[Tensor, "n v 3"], concentration: float) -> Float[Tensor, "n v 3"]:
+        """Average the ambient light's linear rgb radiance over lobes, as `radiance` does for all light."""
+        first = 1 / math.tanh(concentration) - 1 / concentration
+        bands = torch.tensor([1.0] + [first] * 3 + [1 - 3 * first / concentration] * 5)
+        return (spherical_harmonics.basis(directions, 2) @ (bands[:, None] * self.ambient)).clamp_min(0)
+
+    def microfacet_radiance(
+        self, views: Float[Tensor, "n v 3"], normals: Float[Tensor, "n 3"], materials: "Materials"
+    ) -> Float[Tensor, "n v 3"]:
+        """Compute the linear rgb that n GGX surfaces reflect in v views by the sources (Walter et al. 2007).
+
+        Light that the surface masks leaves after further reflections (Turquin 2019).
+
+        Args:
+            views: Unit, from the cameras to points in front of the surfaces.
+            normals: Unit, outward.
+            materials: Materials of the n surfaces, with `roughness`.
+        """
+        assert materials.roughness is not None
+        facing = -(views * normals[:, None]).sum(-1)
+        roughness = materials.roughness.clamp_min(_SMOOTHEST)
+        total = torch.zeros(views.shape)
+        for i in range(len(self.directions)):
+            towards = self.directions[i]
+            half = torch.nn.functional.normalize(towards - views, dim=-1)
+            # a cone of radius r adds the variance r^2 / 4 per axis to the lobe's 2 alpha^2
+            square = (roughness**4 + float(self.softness[i]) ** 2 / 8)[:, None]
+            cosine, incident = (half * normals[:, None]).sum(-1), (normals @ towards)[:, None].clamp_min(0)
+            density = square / (math.pi * (1 + (square - 1) * cosine**2) ** 2)
+            # Smith's masking of view and light over 4 cosines, times the cosine of incidence
+            from_view, from_light = (x + (square + (1 - square) * x**2).sqrt() for x in (facing, incident))
+            factor = density * incident / (from_view * from_light) * materials.fresnel(half @ towards)
+            total = total + (factor * self.visibility[:, i : i + 1])[..., None] * self.irradiance[i]
+        reflected = (1 - _MASKED * roughness**3)[:, None]
+        return total * (materials.reflectance * (1 + materials.reflectance * (1 / reflected - 1)))[:, None]
 
 
 def reflected_light(light: Light, samples: LightSamples, visibility: Float[Tensor, "n k"]) -> ReflectedLight:
@@ -99,6 +133,8 @@ _CONCENTRATIONS = (1.5, 3.0, 6.0, 12.0, 25.0)  # lobes from satin to polished; b
 _EVIDENCE = 0.05  # explained share of pure noise; a lobe that explains as much keeps half of its reflectance
 _LOWEST_COSINE = 0.1  # between normal and view; flatter views are left out
 _MIN_MATT = 0.2  # smallest matt share of a Gaussian's colour
+_SMOOTHEST = 0.05  # perceptual roughness; smoother surfaces are blurred to this one
+_MASKED = 0.62  # share of light that GGX of roughness 1 masks at normal incidence; times roughness^3 for others (fit)
 _FACING = 0.04  # reflectance of a dielectric at normal incidence over grazing incidence (Schlick 1994)
 
 
@@ -118,8 +154,19 @@ class Materials:
     """Share of the lobe in the colour under the old light, in [0, 1]."""
     facing: Float[Tensor, "n"] | None = None
     """Share of a dielectric's reflectance at normal incidence; None for `_FACING`."""
+    roughness: Float[Tensor, "n"] | None = None
+    """Perceptual roughness of GGX surfaces, which reflect sources; None for lobes that were fitted to views."""
     emission: Float[Tensor, "n 3"] | None = None
     """Emitted linear rgb; None for none."""
+
+    def select(self, rows: slice | Int[Tensor, "m"]) -> "Materials":
+        """Select the materials of m Gaussians."""
+        return Materials(**{name: None if values is None else values[rows] for name, values in vars(self).items()})
+
+    def fresnel(self, cosine: Float[Tensor, "n v"]) -> Float[Tensor, "n v"]:
+        """Compute factors on the reflectance for v cosines of incidence (Schlick 1994); 1 for metals."""
+        facing = _FACING if self.facing is None else self.facing[:, None]
+        return torch.where(self.dielectric[:, None], _schlick(cosine, facing), torch.ones(()))
 
     @property
     def glossy(self) -> Bool[Tensor, "n"]:
@@ -135,7 +182,7 @@ class Materials:
 
 
 def known_materials(surface: KnownSurface) -> Materials:
-    """Represent metallic-roughness materials by lobes; sharper reflections than the sharpest lobe are blurred.
+    """Represent metallic-roughness materials by GGX for sources, and by lobes for ambient light.
 
     The concentration of a GGX lobe around the mirrored direction is 1 / (2 alpha^2) (Wang et al. 2009). A rough
     dielectric reflects less towards grazing views (Lagarde 2011). The matt part has factor 1 - mean reflectance.
@@ -144,7 +191,7 @@ def known_materials(surface: KnownSurface) -> Materials:
     metal = surface.metallic[:, None]
     grazing = (1 - surface.roughness).clamp_min(_FACING)
     mean = _FACING + (grazing - _FACING)[:, None] / 21  # integral of Schlick's approximation over the hemisphere
-    sharpness = -math.log(2) - 4 * surface.roughness.clamp_min(0.05).log()
+    sharpness = -math.log(2) - 4 * surface.roughness.clamp_min(_SMOOTHEST).log()
     lobes = torch.tensor(_CONCENTRATIONS)
     return Materials(
         reflectance=torch.where(metal > 0.5, metal * albedo + _FACING * (1 - metal), grazing[:, None]),
@@ -153,6 +200,7 @@ def known_materials(surface: KnownSurface) -> Materials:
         matt=(1 - metal) * (1 - mean) * albedo,
         share=torch.zeros(surface.count),
         facing=_FACING / grazing,
+        roughness=surface.roughness,
         emission=surface.emission,
     )
 
@@ -194,7 +242,7 @@ def estimate_materials(
     old = torch.zeros(n, 3)
     for start in range(0, n, _CHUNK):
         rows = slice(start, start + _CHUNK)
-        part = lobe_radiance(lobes, rows, light, record.mirrored(rows), record.cosine[rows])
+        part = lobe_radiance(lobes, rows, light, normals, record.directions[rows])
         old[rows] = (record.weight[rows, :, None] * part).sum(1)
     left = torch.maximum(base - old, _MIN_MATT * base)
     taken = torch.where(old > 1e-6, (1 - _MIN_MATT) * base / old.clamp_min(1e-6), torch.zeros(())).clamp(0, 1)
@@ -208,11 +256,7 @@ def estimate_materials(
 
 
 def lobe_radiance(
-    materials: Materials,
-    rows: slice,
-    light: ReflectedLight,
-    mirrored: Float[Tensor, "m v 3"],
-    cosine: Float[Tensor, "m v"],
+    materials: Materials, rows: slice, light: ReflectedLight, normals: Float[Tensor, "n 3"], views: Float[Tensor, "m v 3"]
 ) -> Float[Tensor, "m v 3"]:
     """Compute the linear rgb that the lobes of m Gaussians add in v views.
 
@@ -220,23 +264,22 @@ def lobe_radiance(
         materials: Materials of all Gaussians.
         rows: Rows of the m Gaussians.
         light: The light at all Gaussians.
-        mirrored: Directions of the views mirrored by the surface, unit.
-        cosine: Cosine between normals and directions to the cameras.
+        normals: Unit, outward, of all Gaussians.
+        views: Unit, from the cameras to the m Gaussians.
     """
-    reflectance, concentration = materials.reflectance[rows], materials.concentration[rows]
-    out = torch.zeros(mirrored.shape)
-    here = light.select(rows)
-    for value in concentration.unique().tolist():
-        which = ((concentration == value) & (reflectance > 0).any(1)).nonzero()[:, 0]
+    own, here, facing_up = materials.select(rows), light.select(rows), normals[rows]
+    out = torch.zeros(views.shape)
+    for value in own.concentration.unique().tolist():
+        which = ((own.concentration == value) & (own.reflectance > 0).any(1)).nonzero()[:, 0]
         if len(which):
-            part = here.select(which).radiance(mirrored[which], value)
-            facing = _FACING if materials.facing is None else materials.facing[rows][which][:, None]
-            factor = torch.where(
-                materials.dielectric[rows][which][:, None],
-                _schlick(cosine[which], facing),
-                torch.ones(()),
-            )
-            out[which] = part * factor[..., None] * reflectance[which][:, None]
+            seen, normal = views[which], facing_up[which]
+            cosine = -(seen * normal[:, None]).sum(-1)
+            mirrored = seen + 2 * cosine[..., None] * normal[:, None]
+            part, light_there = own.select(which), here.select(which)
+            radiance = light_there.radiance if part.roughness is None else light_there.ambient_radiance
+            out[which] = radiance(mirrored, value) * part.fresnel(cosine)[..., None] * part.reflectance[:, None]
+            if part.roughness is not None:
+                out[which] += light_there.microfacet_radiance(seen, normal, part)
     return out
 
 
@@ -377,9 +420,8 @@ def gloss_bands(
         facing = normals[rows][:, None]
         towards = -(views * facing).sum(-1)
         # views from behind the surface take the reflection of their mirror image in front
-        cosine = towards.abs()
-        in_front = views + (towards - cosine)[..., None] * facing
-        lobe = lobe_radiance(materials, rows, light, in_front + 2 * cosine[..., None] * facing, cosine)
+        in_front = views + (towards - towards.abs())[..., None] * facing
+        lobe = lobe_radiance(materials, rows, light, normals, in_front)
         linear = (materials.matt[rows] * shade[rows])[:, None] + lobe
         if materials.emission is not None:
             linear = linear + materials.emission[rows][:, None]
