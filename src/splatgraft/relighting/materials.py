@@ -388,6 +388,7 @@ def _fitted(
 
 _GLOSS_CHUNK = 4096  # Gaussians at a time; bounds memory
 _VIEWS = 64  # directions over the sphere; twice the number that integrates products of degree 3 exactly
+_BEHIND = 0.1  # weight of views from behind a known surface; .03 gives the same pictures
 _BRIGHTEST = 1.5  # linear; brighter reflections are clipped, so that bands do not ring over the whole object
 
 
@@ -410,7 +411,8 @@ def gloss_bands(
     """
     degree = spherical_harmonics.MAX_DEGREE
     views = even_directions(_VIEWS)
-    project = spherical_harmonics.basis(views, degree) * (4 * math.pi / _VIEWS)
+    basis = spherical_harmonics.basis(views, degree)
+    project = basis * (4 * math.pi / _VIEWS)
     out = torch.zeros(gaussians.count, project.shape[1], 3)
     for start in range(0, gaussians.count, _GLOSS_CHUNK):
         rows = slice(start, start + _GLOSS_CHUNK)
@@ -426,7 +428,13 @@ def gloss_bands(
         if materials.emission is not None:
             linear = linear + materials.emission[rows][:, None]
         srgb = srgb_from_linear(linear.clamp(0, _BRIGHTEST))
-        bands = torch.einsum("vk,nvc->nkc", project, srgb - 0.5)
+        if materials.roughness is None:
+            bands = torch.einsum("vk,nvc->nkc", project, srgb - 0.5)
+        else:
+            # a known surface hides itself from behind, so the bands serve the views in front
+            weights = torch.where(towards > 0, 1.0, _BEHIND)
+            squares = torch.einsum("nv,vk,vl->nkl", weights, basis, basis)
+            bands = torch.linalg.solve(squares, torch.einsum("nv,vk,nvc->nkc", weights, basis, srgb - 0.5))
         bands[:, 0] -= apply_gain(gaussians.select(torch.arange(gaussians.count)[rows]), shade[rows]).sh[:, 0]
         out[rows] = bands * glossy[:, None, None]
     return out
