@@ -14,7 +14,6 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import colors
 from splatgraft.relighting import Light, LightSource, RelightOptions, Relit, SourceScene, relight
 from splatgraft.relighting.light.light import fit_ambient
-from splatgraft.relighting.shading import KNOWN_LIGHTS
 
 WHOLE = RelightOptions(most_added=0.0, fitted_views=0)
 SUN = (0.36, 0.48, 0.8)
@@ -70,11 +69,9 @@ def test_a_matt_ball_has_albedo_times_irradiance_over_pi():
     relit = lit(thing, sky(0.2, sun))
     found = shown(relit, torch.tensor([0.0, 0.0, 1.0]))[:, 0]
     cosine = thing.normals @ torch.tensor(SUN)
-    want = 0.4 / math.pi * (0.2 * math.pi + 3 * cosine.clamp_min(0))
+    # the ball is convex, and nothing else is near
+    expected = 0.4 / math.pi * (0.2 * math.pi + 3 * cosine.clamp_min(0))
     towards_sun = cosine > 0.3  # beyond, a shadow map's bias matters
-    # the ball is convex, and nothing else is near; the share of interreflection is in the settings
-    share = KNOWN_LIGHTS.floor
-    expected = (want + share * want.mean()) / (1 + share)
     # 4% of the light are reflected by a wide lobe instead, which adds a twentieth of the light at most: 4% over .4 / 2
     assert float((found / expected)[towards_sun].log2().abs().max()) < 0.15
     assert float((found / expected)[towards_sun].mean()) == pytest.approx(1, abs=0.06)
@@ -101,6 +98,28 @@ def test_metal_mirrors_the_sun_and_dark_lacquer_shows_only_its_highlight():
     for thing in (ball(0.9, metallic=1.0, roughness=0.5), ball(0.0, roughness=0.5)):
         found = shown(lit(thing, sky(0.02, sun)), towards)[:, 0]
         assert float(found[middle].mean()) > 3 * float(found[aside].mean())
+
+
+@pytest.mark.parametrize("roughness", [0.45, 0.6])
+def test_metal_reflects_the_sun_far_from_its_highlight_as_ggx_does(roughness):
+    towards, light = torch.tensor([0.6, 0.0, 0.8]), torch.tensor(SUN)
+    thing = ball(0.5, metallic=1.0, roughness=roughness)
+    relit = lit(thing, sky(1e-3, LightSource(SUN, (0.5, 0.5, 0.5), angular_radius_deg=0.3)))
+    found = shown(relit, towards)[:, 0]
+    # Walter et al. 2007, Eqs. 20 and 33 to 34, written with tangents
+    half = torch.nn.functional.normalize(towards + light, dim=0)
+    cosines = [thing.normals @ direction for direction in (towards, light, half)]
+    facing, incident, middle = (cosine.clamp_min(1e-3) for cosine in cosines)
+    square = roughness**4
+    density = square / (math.pi * middle**4 * (square + 1 / middle**2 - 1) ** 2)
+    masking = [2 / (1 + (1 + square * (1 / x**2 - 1)).sqrt()) for x in (facing, incident)]
+    expected = 0.5 * 0.5 * density * masking[0] * masking[1] / (4 * facing)
+    angle = middle.clamp(max=1).acos().rad2deg()
+    both = (facing > 0.3) & (incident > 0.3)
+    # reflections after the first add up to a tenth; bands of degree 3 flatten the peak
+    for low, high in ((20, 35), (35, 50)):
+        ring = both & (angle > low) & (angle < high)
+        assert float(found[ring].mean() / expected[ring].mean()) == pytest.approx(1.0, abs=0.25)
 
 
 def test_emission_adds_to_reflected_light():

@@ -22,6 +22,7 @@ from splatgraft.relighting.prepared_object import PreparedObject
 from splatgraft.relighting.scene_light import SceneLight
 from splatgraft.relighting.shading import (
     KNOWN_LIGHTS,
+    KNOWN_SURFACES,
     ShadeSettings,
     apply_gain,
     irradiance,
@@ -272,8 +273,10 @@ def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Ten
     source = one.source_lighting
     if source is None:
         return _Shading(received, unknown_origin_ratio(received, opacities), None)
-    is_known = isinstance(one.gaussians, KnownSurface) or scene.estimate is None
-    settings = KNOWN_LIGHTS if is_known and source.estimate is None else ShadeSettings()
+    if isinstance(one.gaussians, KnownSurface):
+        settings = KNOWN_SURFACES
+    else:
+        settings = KNOWN_LIGHTS if scene.estimate is None and source.estimate is None else ShadeSettings()
     shade = shade_ratio(received, source.irradiance, opacities, settings=settings)
     if not bool(source.materials.glossy.any()):
         return _Shading(received, shade, None)

@@ -38,6 +38,8 @@ class ShadeSettings:
 
 KNOWN_LIGHTS = ShadeSettings(level_share=1.0, tint_share=1.0)
 """Settings for two given lights, which are certain."""
+KNOWN_SURFACES = ShadeSettings(floor=0.0, level_share=1.0, tint_share=1.0)
+"""Settings for surfaces of known albedo, with no old light whose errors a floor would damp."""
 
 
 def soft_cosine(cosine: Float[Tensor, "n k"], softness: Float[Tensor, "k"]) -> Float[Tensor, "n k"]:
