@@ -14,6 +14,7 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import colors
 from splatgraft.relighting import Light, LightSource, RelightOptions, Relit, SourceScene, relight
 from splatgraft.relighting.light.light import fit_ambient
+from splatgraft.relighting.materials import ReflectedLight, known_materials
 
 WHOLE = RelightOptions(most_added=0.0, fitted_views=0)
 SUN = (0.36, 0.48, 0.8)
@@ -120,6 +121,23 @@ def test_metal_reflects_the_sun_far_from_its_highlight_as_ggx_does(roughness):
     for low, high in ((20, 35), (35, 50)):
         ring = both & (angle > low) & (angle < high)
         assert float(found[ring].mean() / expected[ring].mean()) == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.6, 0.9])
+def test_white_metal_under_lamps_all_around_is_white(roughness):
+    count = 3000
+    lamps = ReflectedLight(
+        directions=even_directions(count),
+        irradiance=torch.full((count, 3), 4 * math.pi / count),
+        softness=torch.zeros(count),
+        visibility=torch.ones(1, count),
+        ambient=torch.zeros(9, 3),
+    )
+    white = known_materials(ball(1.0, metallic=1.0, roughness=roughness, count=1))
+    views = torch.tensor([[[0.0, 0.0, -1.0], [0.6, 0.0, -0.8]]])
+    found = lamps.microfacet_radiance(views, torch.tensor([[0.0, 0.0, 1.0]]), white)
+    # without further reflections .99, .82 and .42; their fit is within a sixth
+    assert found == pytest.approx(1.0, abs=0.17)
 
 
 def test_emission_adds_to_reflected_light():

@@ -7,9 +7,9 @@
 
 import math
 
-import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -259,26 +259,11 @@ def _looked_up(
     image = torch.from_numpy(texture.pixels.astype(np.float32) / 255)
     if is_srgb:
         image[..., :3] = linear_from_srgb(image[..., :3])
-    level_image = image.numpy()
-    h, w = level_image.shape[:2]
-    texels = footprint * abs(np.linalg.det(matrix[:, :2])) * h * w
+    levels = [image.permute(2, 0, 1)[None]]
+    texels = footprint * abs(np.linalg.det(matrix[:, :2])) * image.shape[0] * image.shape[1]
     level = (0.5 * np.log2(np.maximum(texels, 1))).astype(int)
-    out = np.empty((len(uv), 4))
-    for step in range(int(level.max(initial=0)) + 1):
-        h, w = level_image.shape[:2]
-        here = level == step if min(h, w) > 1 else level >= step
-        x, y = at[here, 0] * w - 0.5, at[here, 1] * h - 0.5
-        out[here] = _bilinear(level_image, x, y)
-        if min(h, w) == 1:
-            break
-        level_image = cv2.resize(level_image, (max(w // 2, 1), max(h // 2, 1)), interpolation=cv2.INTER_AREA)
-    return out
-
-
-def _bilinear(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> Float[np.ndarray, "n 4"]:
-    h, w = image.shape[:2]
-    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
-    fx, fy = (x - left)[:, None], (y - top)[:, None]
-    columns, rows = (left.clip(0, w - 1), (left + 1).clip(0, w - 1)), (top.clip(0, h - 1), (top + 1).clip(0, h - 1))
-    upper, lower = ((1 - fx) * image[row, columns[0]] + fx * image[row, columns[1]] for row in rows)
-    return (1 - fy) * upper + fy * lower
+    while len(levels) <= level.max(initial=0) and min(levels[-1].shape[2:]) > 1:
+        levels.append(F.interpolate(levels[-1], scale_factor=0.5, mode="area"))
+    grid = torch.from_numpy(2 * at - 1).float()[None, None]  # -1 and 1 are the image's borders
+    found = [F.grid_sample(one, grid, padding_mode="border", align_corners=False)[0, :, 0] for one in levels]
+    return torch.stack(found).numpy()[level.clip(max=len(levels) - 1), :, np.arange(len(uv))]

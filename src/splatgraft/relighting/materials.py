@@ -134,7 +134,7 @@ _EVIDENCE = 0.05  # explained share of pure noise; a lobe that explains as much 
 _LOWEST_COSINE = 0.1  # between normal and view; flatter views are left out
 _MIN_MATT = 0.2  # smallest matt share of a Gaussian's colour
 _SMOOTHEST = 0.05  # perceptual roughness; smoother surfaces are blurred to this one
-_MASKED = 0.62  # share of light that GGX of roughness 1 masks at normal incidence; times roughness^3 for others (fit)
+_MASKED = math.log(2)  # share of light that GGX of roughness 1 masks at normal incidence; about times roughness^3
 _FACING = 0.04  # reflectance of a dielectric at normal incidence over grazing incidence (Schlick 1994)
 
 
@@ -256,7 +256,11 @@ def estimate_materials(
 
 
 def lobe_radiance(
-    materials: Materials, rows: slice, light: ReflectedLight, normals: Float[Tensor, "n 3"], views: Float[Tensor, "m v 3"]
+    materials: Materials,
+    rows: slice,
+    light: ReflectedLight,
+    normals: Float[Tensor, "n 3"],
+    views: Float[Tensor, "m v 3"],
 ) -> Float[Tensor, "m v 3"]:
     """Compute the linear rgb that the lobes of m Gaussians add in v views.
 

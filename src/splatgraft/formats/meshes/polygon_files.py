@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
+from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.meshes import MAX_TRIANGLES, Mesh, MeshMaterial, Texture, flat_normals, unit
 from splatgraft.formats.gltf import read_uri
 from splatgraft.formats.meshes.gltf_mesh import decode_image
@@ -79,8 +81,8 @@ def _part(mesh: Any, turn: Float[np.ndarray, "3 3"]) -> tuple[tuple[np.ndarray, 
         normals = np.where((given != 0).any(-1, keepdims=True), given, normals)
     uv, colors = np.zeros((*faces.shape, 2), np.float32), np.ones(corners.shape, np.float32)
     if mesh.visual.kind == "vertex":
-        srgb = np.asarray(mesh.visual.vertex_colors)[faces][..., :3] / np.float32(255)
-        return (corners, normals, uv, _linear(srgb)), MeshMaterial()
+        srgb = torch.from_numpy(np.asarray(mesh.visual.vertex_colors)[faces][..., :3] / np.float32(255))
+        return (corners, normals, uv, linear_from_srgb(srgb).numpy()), MeshMaterial()
     if mesh.visual.kind != "texture":
         return (corners, normals, uv, colors), MeshMaterial()
     given, image = mesh.visual.uv, getattr(mesh.visual.material, "image", None)
@@ -91,11 +93,7 @@ def _part(mesh: Any, turn: Float[np.ndarray, "3 3"]) -> tuple[tuple[np.ndarray, 
         image.convert("RGBA").save(buffer, "PNG")
         texture = Texture(decode_image(buffer.getvalue()))
     material = mesh.visual.material.to_pbr()
-    rgba = np.asarray(material.baseColorFactor if material.baseColorFactor is not None else [255] * 4) / 255
-    r, g, b = (float(x) for x in _linear(rgba[:3]))
+    rgba = [255] * 4 if material.baseColorFactor is None else material.baseColorFactor
+    r, g, b = linear_from_srgb(torch.tensor(rgba[:3]) / 255).tolist()
     roughness = 1.0 if material.roughnessFactor is None else float(material.roughnessFactor)
     return (corners, normals, uv, colors), MeshMaterial((r, g, b, 1.0), roughness=roughness, color_map=texture)
-
-
-def _linear(srgb: np.ndarray) -> np.ndarray:
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
