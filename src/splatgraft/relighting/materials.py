@@ -50,6 +50,11 @@ class ReflectedLight:
         """Multiply every channel of the light by a factor."""
         return replace(self, irradiance=self.irradiance * factor, ambient=self.ambient * factor)
 
+    def windowed(self) -> "ReflectedLight":
+        """Multiply the ambient harmonics by Lanczos' factors, so that their series does not ring (Sloan 2008)."""
+        factors = torch.sinc(torch.tensor([0.0] + [1.0] * 3 + [2.0] * 5) / 3)
+        return replace(self, ambient=factors[:, None] * self.ambient)
+
     def radiance(self, directions: Float[Tensor, "n v 3"], concentration: float) -> Float[Tensor, "n v 3"]:
         """Average linear rgb radiance at n points over lobes around v directions each.
 
@@ -161,7 +166,7 @@ class Materials:
 
     def select(self, rows: slice | Int[Tensor, "m"]) -> "Materials":
         """Select the materials of m Gaussians."""
-        return Materials(**{name: None if values is None else values[rows] for name, values in vars(self).items()})
+        return Materials(**{name: values[rows] for name, values in vars(self).items() if values is not None})
 
     def fresnel(self, cosine: Float[Tensor, "n v"]) -> Float[Tensor, "n v"]:
         """Compute factors on the reflectance for v cosines of incidence (Schlick 1994); 1 for metals."""
@@ -418,6 +423,7 @@ def gloss_bands(
     basis = spherical_harmonics.basis(views, degree)
     project = basis * (4 * math.pi / _VIEWS)
     out = torch.zeros(gaussians.count, project.shape[1], 3)
+    light = light if materials.roughness is None else light.windowed()
     for start in range(0, gaussians.count, _GLOSS_CHUNK):
         rows = slice(start, start + _GLOSS_CHUNK)
         glossy = materials.glossy[rows]

@@ -43,7 +43,7 @@ class SceneLight:
     receivers_of: tuple[BoundingSphere, ...]
     """Bounding spheres of the objects for which the receivers were chosen."""
     reach: float
-    """Maximum length of shadows, object radii."""
+    """Maximum length of shadows except umbras, object radii."""
 
     def moved(self, spheres: Sequence[BoundingSphere]) -> "SceneLight | NoLight | None":
         """Move the objects: keep sources and shadow maps, and compute the ambient light at the new place.
@@ -89,7 +89,7 @@ def find_scene_light(
         captured: The scene without erased Gaussians.
         spheres: Bounding spheres of the objects, at least one.
         light: A given light, with sources as seen from the objects' place; None to estimate it.
-        reach: Maximum length of shadows, object radii.
+        reach: Maximum length of shadows except umbras, object radii.
         sun_through: Points and their shadows, as for `light.sun.set_sun`, from which an estimate takes its sun.
 
     Returns:

@@ -31,7 +31,7 @@ class RelightOptions:
     """Length of shadows, sun, and number of Gaussians that may be added."""
 
     reach: float = 8.0
-    """Maximum length of shadows, object radii from the object."""
+    """Maximum length of shadows, object radii from the object; the umbra of a distant source may be longer."""
     most_added: float = 0.3
     """Maximum number of Gaussians added by splitting, as a share of the composite's Gaussians; a maximum below 40,000
     is raised to it, but 0 adds none."""

@@ -128,7 +128,7 @@ class SceneShadowMaps:
         found = away.norm(dim=1) < self.region.radius
         if self.source_maps is not None:
             for direction in self.source_maps.window.directions:
-                found |= torch.linalg.cross(away, direction.expand_as(away)).norm(dim=1) < self.region.radius
+                found |= torch.linalg.cross(away, direction[None]).norm(dim=1) < self.region.radius
         return found
 
 
@@ -145,16 +145,15 @@ def scene_shadow_maps(
     """
     maps: list[DepthMaps | None] = []
     reach = 1.5 * region.radius + 3 * scene.scales.max(1).values
-    away = scene.means - region.center
+    away, sources = scene.means - region.center, samples.of_sources
     near = away.norm(dim=1) < reach
-    sources = samples.of_sources
+    in_beam = near.clone()
     for direction, length in zip(sources.directions, umbra_lengths(sources, radius), strict=True):
         along = -(away @ direction)
-        aside = torch.linalg.cross(away, direction.expand_as(away)).norm(dim=1)
-        near |= (along > 0) & (along < length) & (aside < reach)
-    blockers = scene.select(near)
-    sizes = (_SOURCE_SIZE, _AMBIENT_SIZE)
-    for part, size in zip((samples.of_sources, samples.of_ambient), sizes, strict=True):
+        in_beam |= (along > 0) & (along < length) & (torch.linalg.cross(away, direction[None]).norm(dim=1) < reach)
+    parts = ((sources, _SOURCE_SIZE, in_beam), (samples.of_ambient, _AMBIENT_SIZE, near))
+    for part, size, is_blocker in parts:
+        blockers = scene.select(is_blocker)
         window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
         nearest = -torch.tensor(part.blockers_within).clamp_max(region.radius)
         # Gaussians finer than a pixel of the map add no detail, so a random part of them is enough
@@ -308,9 +307,8 @@ def reachable(
     inside = distance - rims < farthest
     reached = inside & (distance - rims < 3.5 * sphere.radius)  # reach of ambient shadow and bounce; set by hand
     sources = samples.of_sources
-    parts = zip(
-        sources.directions, sources.softness, sources.distances, umbra_lengths(sources, sphere.radius), strict=True
-    )
+    lengths = umbra_lengths(sources, sphere.radius)
+    parts = zip(sources.directions, sources.softness, sources.distances, lengths, strict=True)
     for direction, softness, light_distance, length in parts:
         along = -(away @ direction)
         aside = (distance**2 - along**2).clamp_min(0).sqrt()
