@@ -18,6 +18,7 @@ from splatgraft.rendering.cpu_simd import (
     larger,
     largest,
     load,
+    prefetch,
     smaller,
     store,
     total,
@@ -29,6 +30,7 @@ from splatgraft.runtime.kernels import kernel
 
 PIXELS = TILE * TILE
 BATCH = 32
+AHEAD = 8  # entries
 RGB = 3
 MAX_ALPHA = float32(0.99)
 MIN_TRANSMITTANCE = np.float32(1e-4)
@@ -54,6 +56,14 @@ def splat_shape(splats, s, x0, y0):
     bottom = int(max(min(my + reach + ONE, float32(TILE)), ZERO))
     a, b, c = -HALF * SIXTEENTH * splats[s, CA], -SIXTEENTH * splats[s, CB], -HALF * SIXTEENTH * splats[s, CC]
     return mx, my, a, b, c, SIXTEENTH * splats[s, LOG_OPACITY], top, bottom
+
+
+@kernel
+@no_type_check
+def fetch_ahead(array, entries, k):
+    """Begin to read the row of `array` that a later entry needs, because entries are spread over all splats."""
+    if k + AHEAD < entries.shape[0]:
+        prefetch(array, entries[k + AHEAD])
 
 
 @kernel
@@ -94,6 +104,8 @@ def _blend_rgb(splats, entries, rows, values, x0, y0, work, least):
     """Planes of `work`: transmittance, red, green, blue."""
     for k in range(entries.shape[0]):
         s = entries[k]
+        fetch_ahead(splats, entries, k)
+        fetch_ahead(values, entries, k)
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
         top, bottom = kept_rows(rows, k, top, bottom)
         red, green, blue = values[s, 0], values[s, 1], values[s, 2]
@@ -118,6 +130,8 @@ def _blend_any(splats, entries, rows, values, x0, y0, work, least):
     """Planes of `work`: transmittance, then the channels."""
     for k in range(entries.shape[0]):
         s = entries[k]
+        fetch_ahead(splats, entries, k)
+        fetch_ahead(values, entries, k)
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
         top, bottom = kept_rows(rows, k, top, bottom)
         dx = lanes() - mx
@@ -183,6 +197,7 @@ def read_tile(image, x0, y0, work, plane):
 def _transpose_rgb(splats, entries, rows, slots, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, red, green, blue."""
     for k in range(entries.shape[0]):
+        fetch_ahead(splats, entries, k)
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, entries[k], x0, y0)
         top, bottom = kept_rows(rows, k, top, bottom)
         dx = lanes() - mx
@@ -211,6 +226,7 @@ def _transpose_any(splats, entries, rows, slots, x0, y0, work, sums, least):
     channels = sums.shape[1]
     column = np.empty(channels * TILE, np.float32)
     for k in range(entries.shape[0]):
+        fetch_ahead(splats, entries, k)
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, entries[k], x0, y0)
         top, bottom = kept_rows(rows, k, top, bottom)
         dx = lanes() - mx
@@ -276,6 +292,8 @@ def _backward_rgb(splats, entries, slots, values, x0, y0, work, sums, least):
     """Planes of `work`: transmittance, rest, gradients of alpha, red, green, blue."""
     for k in range(entries.shape[0]):
         s, slot = entries[k], slots[k]
+        fetch_ahead(splats, entries, k)
+        fetch_ahead(values, entries, k)
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
         red, green, blue = values[s, 0], values[s, 1], values[s, 2]
         dx = lanes() - mx
@@ -316,6 +334,8 @@ def _backward_any(splats, entries, slots, values, x0, y0, work, sums, least):
     column = np.empty(channels * TILE, np.float32)
     for k in range(entries.shape[0]):
         s, slot = entries[k], slots[k]
+        fetch_ahead(splats, entries, k)
+        fetch_ahead(values, entries, k)
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
         dx = lanes() - mx
         across = dx * dx * a + d

@@ -18,6 +18,7 @@ from splatgraft.rendering.cpu_blend import (
     ZERO,
     alpha_row,
     exponent_gradient,
+    fetch_ahead,
     open_rest,
     open_tile,
     read_tile,
@@ -53,6 +54,8 @@ def median_depth(splats, start, entries, inverse_depths, depth):
         x0, y0, work = open_tile(tile, depth.shape[1], 2)
         for k in range(start[tile], start[tile + 1]):
             s = entries[k]
+            fetch_ahead(splats, entries, k)
+            fetch_ahead(inverse_depths, entries, k)
             mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, float32(x0), float32(y0))
             dx = lanes() - mx
             across = dx * dx * a + d
@@ -81,6 +84,9 @@ def _blend_tile(splats, entries, values, inverse_depths, x0, y0, work, least):
     """Planes of `work`: transmittance, red, green, blue, inverse depth."""
     for k in range(entries.shape[0]):
         s = entries[k]
+        fetch_ahead(splats, entries, k)
+        fetch_ahead(values, entries, k)
+        fetch_ahead(inverse_depths, entries, k)
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
         red, green, blue = values[s, 0], values[s, 1], values[s, 2]
         dx = lanes() - mx
@@ -126,6 +132,9 @@ def _backward_tile(splats, entries, slots, values, inverse_depths, x0, y0, work,
     """Planes of `work`: transmittance, rest, gradients of alpha, red, green, blue and inverse depth."""
     for k in range(entries.shape[0]):
         s, slot = entries[k], slots[k]
+        fetch_ahead(splats, entries, k)
+        fetch_ahead(values, entries, k)
+        fetch_ahead(inverse_depths, entries, k)
         mx, my, a, b, c, d, top, bottom = splat_shape(splats, s, x0, y0)
         red, green, blue = values[s, 0], values[s, 1], values[s, 2]
         dx = lanes() - mx

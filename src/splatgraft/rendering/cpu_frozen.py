@@ -18,6 +18,7 @@ from splatgraft.rendering.cpu_blend import (
     PIXELS,
     ZERO,
     alpha_row,
+    fetch_ahead,
     open_tile,
     saturated,
     splat_shape,
@@ -43,6 +44,7 @@ def find_rows(splats, start, entries, size, min_weight, rows):
         for k in range(start[tile], start[tile + 1]):
             rows[k, 0], rows[k, 1] = 0, 0
         for k in range(start[tile], start[tile + 1]):
+            fetch_ahead(splats, entries, k)
             mx, my, a, b, c, d, top, bottom = splat_shape(splats, entries[k], float32(x0), float32(y0))
             dx = lanes() - mx
             across = dx * dx * a + d
@@ -77,6 +79,8 @@ def _blend_and_keep(splats, entries, rows, values, x0, y0, work, weights):
     kept = 0
     for k in range(entries.shape[0]):
         s = entries[k]
+        fetch_ahead(splats, entries, k)
+        fetch_ahead(values, entries, k)
         mx, my, a, b, c, d, _, _ = splat_shape(splats, s, x0, y0)
         red, green, blue = values[s, 0], values[s, 1], values[s, 2]
         dx = lanes() - mx
@@ -133,6 +137,8 @@ def _blend_one_and_keep(splats, entries, rows, values, x0, y0, work, weights):
     kept = 0
     for k in range(entries.shape[0]):
         s = entries[k]
+        fetch_ahead(splats, entries, k)
+        fetch_ahead(values, entries, k)
         mx, my, a, b, c, d, _, _ = splat_shape(splats, s, x0, y0)
         value = values[s]
         dx = lanes() - mx

@@ -98,6 +98,27 @@ def store(_typing, array, at, row):
 
 @intrinsic
 @no_type_check
+def prefetch(_typing, array, at):
+    """Begin to read row `at` of an array into the cache, so that a random access later does not wait."""
+
+    def generate(context, builder, sig, args):
+        made = context.make_array(sig.args[0])(context, builder, args[0])
+        begin = builder.bitcast(made.data, ir.IntType(8).as_pointer())
+        place = builder.gep(begin, [builder.mul(args[1], cgutils.unpack_tuple(builder, made.strides)[0])])
+        number = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [place.type, number, number, number])
+        # of data, to read, into all levels
+        builder.call(
+            cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0"),
+            [place, ir.Constant(number, 0), ir.Constant(number, 3), ir.Constant(number, 1)],
+        )
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp), generate
+
+
+@intrinsic
+@no_type_check
 def broadcast(_typing, value):
     """Make a row with one float32 in all lanes."""
     return _ROW(types.float32), lambda _context, builder, _signature, args: _broadcast(builder, args[0])

@@ -7,10 +7,12 @@ import numpy as np
 from numba import prange
 
 from splatgraft.rendering.cpu_project import CA, CB, CC, COLUMNS, LOG_OPACITY, MX, MY, REACH_X, REACH_Y
+from splatgraft.rendering.cpu_simd import prefetch
 from splatgraft.runtime.kernels import kernel
 
 TILE = 16
 _DIGIT_BITS = 11
+_AHEAD = 16  # splats
 _CHUNKS = 8  # parts of the splats that are listed side by side
 
 
@@ -84,6 +86,8 @@ def _pack(splats, order, tiles_y, packed, row_counts):
     for chunk in prange(_CHUNKS):
         for s in range(m * chunk // _CHUNKS, m * (chunk + 1) // _CHUNKS):
             g = order[s]
+            if s + _AHEAD < m:
+                prefetch(splats, order[s + _AHEAD])
             for column in range(COLUMNS):
                 packed[s, column] = splats[g, column]
             top, bottom = _tile_range(packed[s, MY], packed[s, REACH_Y], tiles_y)
