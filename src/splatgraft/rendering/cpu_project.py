@@ -14,6 +14,7 @@ from splatgraft.rendering.cpu_basis import basis_and_slope, basis_at
 from splatgraft.runtime.kernels import kernel
 
 MIN_ALPHA = 1.0 / 255.0
+WIDEST = 2.001 * math.log(1 / MIN_ALPHA)  # square of the half width of an opaque splat over its variance, rounded up
 BLOCK = 256
 ZERO, HALF = float32(0), float32(0.5)
 
@@ -102,12 +103,22 @@ def project(means, log_scales, quaternions, opacity_logits, camera, antialiased,
         for g in range(block * BLOCK, min(n, (block + 1) * BLOCK)):
             splats[g, LOG_OPACITY] = -np.inf
             x, y, z = _camera_point(means[g], camera, offset)
+            if not (z >= camera[NEAR] and z < 1e30):
+                continue
+            j00, j02, j11, j12, _, _ = _jacobian(x, y, z, camera)
+            mx, my = camera[FX] * x / z + camera[CX], camera[FY] * y / z + camera[CY]
+            # most Gaussians outside the image are so even as opaque balls as wide as their longest axis
+            widest = math.exp(2 * float(max(log_scales[g, 0], log_scales[g, 1], log_scales[g, 2])))
+            out_x, out_y = max(-mx, mx - camera[WIDTH], 0.0), max(-my, my - camera[HEIGHT], 0.0)
+            if out_x * out_x > WIDEST * (widest * (j00 * j00 + j02 * j02) + low):
+                continue
+            if out_y * out_y > WIDEST * (widest * (j11 * j11 + j12 * j12) + low):
+                continue
             opacity = 1.0 / (1.0 + math.exp(-float(opacity_logits[g])))
-            if not (z >= camera[NEAR] and z < 1e30 and opacity >= MIN_ALPHA):
+            if not opacity >= MIN_ALPHA:
                 continue
             _rotation(quaternions[g], rotation)
             _view_axes(log_scales[g], rotation, camera, axes)
-            j00, j02, j11, j12, _, _ = _jacobian(x, y, z, camera)
             xx, xy, yy = 0.0, 0.0, 0.0
             for j in range(3):
                 h0, h1 = j00 * axes[0, j] + j02 * axes[2, j], j11 * axes[1, j] + j12 * axes[2, j]
@@ -120,7 +131,6 @@ def project(means, log_scales, quaternions, opacity_logits, camera, antialiased,
             if not (opacity >= MIN_ALPHA and determinant < 1e30):
                 continue
             limit = 2 * math.log(opacity / MIN_ALPHA)
-            mx, my = camera[FX] * x / z + camera[CX], camera[FY] * y / z + camera[CY]
             reach_x, reach_y = math.sqrt(limit * (xx + low)), math.sqrt(limit * (yy + low))
             if not (-reach_x < mx < camera[WIDTH] + reach_x and -reach_y < my < camera[HEIGHT] + reach_y):
                 continue
