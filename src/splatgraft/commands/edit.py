@@ -1,5 +1,6 @@
 """The command `edit`: the web editor on one project, for the browsers of this machine."""
 
+import gc
 import secrets
 import signal
 import threading
@@ -53,9 +54,12 @@ class Edit:
             server = Server(token, host=LOOPBACK[0], port=self.port)
             self._say_address(f"http://{LOOPBACK[0]}:{server.port}/?token={token}", console)
             # torch, numba and the scenes take seconds to load; the browser opens the page meanwhile
+            gc.disable()  # while modules load, nothing becomes garbage, and the search for it takes a sixth of the time
             from splatgraft.editor.editor import Editor
             from splatgraft.editor.project import Project
 
+            gc.freeze()
+            gc.enable()
             editor = Editor(server, Project(file, out))
             stop.wait()
             editor.close()

@@ -50,6 +50,7 @@ KINDS: dict[str, Kind] = {
 _POLL_SECONDS = 0.4
 _MARK_SECONDS = 1.0  # time without a change before the steps' marks are updated
 _PAUSE_SECONDS = 0.2  # time without a move in a drag before the light of its place is requested
+_IDLE_SECONDS = 0.5  # time at rest before drafts of the light are prepared
 _DRAWN_SECONDS = 0.3  # longest wait of a drag's next move for the picture of the last one
 _CURRENT, _DONE, _STALE, _NEXT = "●", "✓", "↻", "›"
 _WORDS = {"do": "id", "live": "id", "key": "key", "step": "to"}
@@ -348,8 +349,10 @@ class Editor:
             return
         if self.live is not None:
             self._light.want(state, "draft")
-        else:
-            self._light.want(state, "prepared" if stage == "file" and self.step != "Light" else "final")
+        elif stage != "file" or self.step == "Light":
+            self._light.want(state, "final")
+        elif self.stream.is_at_rest(_IDLE_SECONDS):
+            self._light.want(state, "prepared")
 
     def _lit(self, state: EditState, lit: Lit) -> None:
         if self.pictures is not None and self._is_open:
@@ -639,6 +642,7 @@ class Editor:
                 self.is_unsaved = False
                 self.say("saved again")
                 self.refresh()
+            self._want_light()  # of drafts that are prepared at rest
             state = None if session is None else session.jobs.state()
             if state is not None:
                 self._show_job(state)

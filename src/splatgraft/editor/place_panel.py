@@ -308,11 +308,11 @@ class PlacePanel(Panel):
         items = self.editor.shown_state().objects or ()
         hulls = []
         for item in items:
-            one = session.scenes.placeable_object(item)
+            # without its base, which takes longer to find than the first picture
+            path = session.scenes.object_path(item)
+            one = session.scenes.gaussians(path)
             solid = session.scenes.derive(
-                f"solid {session.scenes.object_path(item)}",
-                (one,),
-                lambda one=one: one.gaussians.means[one.gaussians.opacities > _MIN_OPACITY],
+                f"solid {path}", (one,), lambda one=one: one.means[one.opacities > _MIN_OPACITY]
             )
             hulls.append(outline(item.target_from_object.points(solid), camera))
         over: dict[str, Any] = {"hulls": hulls, "chosen": self._chosen if len(items) > 1 else -1}

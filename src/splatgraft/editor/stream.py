@@ -117,6 +117,14 @@ class Stream:
                 one.touched(moving=moving)
             self._wake.notify_all()
 
+    def is_at_rest(self, seconds: float) -> bool:
+        """Return whether all windows have got their full pictures, and nothing has moved for some time."""
+        with self._wake:
+            now = time.monotonic()
+            return all(
+                view.sent and self._wait(view, now) == np.inf and now - view.moved_at > seconds for view in self.views
+            )
+
     def wait_drawn(self, view: View, seconds: float) -> None:
         """Wait until a window's current content is drawn, at most `seconds`."""
         with self._wake:
