@@ -9,7 +9,7 @@ from unittest.mock import MagicMock
 import pytest
 import torch
 from editor_pages import cloud
-from shapes import ring, sunlit_scene, surfels
+from shapes import UP, ring, sunlit_scene, surfels
 from test_state import LIGHT, moved
 from tiny_project import copy_of
 
@@ -24,11 +24,11 @@ from splatgraft.editor import relit_preview, transfer_values
 from splatgraft.editor.light_process import LightProcess, Lit
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.project import Project
-from splatgraft.editor.relit_preview import CoarseGaussians, RelitPreview, coarsen, upsample_light
+from splatgraft.editor.relit_preview import CoarseGaussians, Draft, RelitPreview, coarse_draft, coarsen
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState
 from splatgraft.editor.transfer_values import TransferValues
-from splatgraft.formats import read_gaussians
+from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LayerWeights, Light, RelightOptions, SourceScene
 from splatgraft.relighting.layers import pasted
@@ -98,6 +98,28 @@ def test_a_moved_object_keeps_its_colours_over_a_contact_shadow_until_its_light_
     assert torch.equal(lit.place(state).sh, session.scenes.gaussians(session.files.target_scene).sh)
 
 
+def test_a_dragged_object_stands_on_its_flattened_support_wherever_it_was_before(session: Session) -> None:
+    x = torch.linspace(-1.5, 1.5, 120)
+    grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
+    heights = 0.03 * torch.randn(len(grid), 1, generator=torch.Generator().manual_seed(0))  # a layer, not a sheet
+    floor = surfels(torch.cat([grid, heights], 1), UP.repeat(len(grid), 1), width=0.03, thickness=0.02)
+    write_gaussians(session.files.target_scene, floor)
+    lit, state = Pictures(session.scenes).lit, session.placed_state()
+    item, place = session.objects()[0], lit.place(state)
+    placed = item.target_from_object
+    for shift in ([0.5, 0.2, 0.0], [-0.4, 0.3, 0.0], [0.1, -0.3, 0.5]):
+        there = replace(placed, translation=placed.translation + torch.tensor(shift))
+        dragged = state.with_object(0, replace(item, target_from_object=there))
+        scene = lit.scene(dragged)
+        expected = session.scenes.composite(dragged).merged()[0]
+        # the step's composite; the colours have the contact shadow of this place alone
+        assert torch.equal(scene.means, expected.means)
+        assert torch.equal(scene.log_scales, expected.log_scales)
+        assert torch.equal(scene.sh, Pictures(session.scenes).lit.scene(dragged).sh)
+        is_flat = not torch.equal(scene.means[: place.count], place.means)
+        assert is_flat == (shift[2] == 0)  # nothing is flattened under an object in the air
+
+
 def test_a_finished_light_is_read_from_its_file(session: Session) -> None:
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
     lit, state = Pictures(session.scenes).lit, session.placed_state()
@@ -113,10 +135,10 @@ def test_the_previewed_light_equals_the_step_s_result(session: Session, light: L
     session.change(replace(moved(session.placed_state()), weights=LayerWeights(shadow=0.5), light=light))
     relighting = RelitPreview(session.scenes)
     # a draft must not change the full result
-    draft = relighting.layers(session.state, draft=True)
+    draft = relighting.draft(session.state).of_all(session.scenes.composite(session.state))
     assert not relighting.is_relit(session.state)
-    relit = relighting.layers(session.state, draft=False)
-    assert relighting.layers(session.state, draft=True) is relit
+    relit = relighting.relit(session.state)
+    assert relighting.is_relit(session.state)
     assert draft.gaussians.count <= relit.gaussians.count
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
     written, shown = read_gaussians(session.files.relit), relit.bake(session.state.weights)[0]
@@ -127,14 +149,13 @@ def test_the_previewed_light_equals_the_step_s_result(session: Session, light: L
 def test_the_light_after_a_move_equals_the_step_s_result(session: Session) -> None:
     relighting, first = RelitPreview(session.scenes), session.placed_state()
     relighting.relit(first)
-    assert not relighting.refine(first)
+    assert relighting.refined(first) is None
     session.change(moved(first))
-    draft = relighting.draft(session.state)
+    relighting.draft(session.state)
     # drafts keep the sources of the light, which were estimated at another place
-    assert relighting.refine(session.state)
-    assert relighting.layers(session.state, draft=True) is not draft
+    assert relighting.refined(session.state) is not None
     relit = relighting.relit(session.state)
-    assert not relighting.refine(session.state)
+    assert relighting.refined(session.state) is None
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
     assert torch.equal(read_gaussians(session.files.relit).sh, relit.bake(session.state.weights)[0].sh)
 
@@ -177,8 +198,9 @@ def test_the_light_process_makes_drafts_of_what_is_asked_last(session: Session) 
         assert not any(shown is state for shown, _ in received)  # what is only prepared is not sent
         shown, lit = received[-1]
         assert lit.stage == "draft"
-        assert lit.relit.gaussians.count == 0
-        expected = RelitPreview(session.scenes).draft(shown)
+        assert isinstance(lit.layers, Draft)
+        assert lit.layers.relit.gaussians.count == 0
+        expected = RelitPreview(session.scenes).draft(shown).of_all(session.scenes.composite(shown))
         scenes = Pictures(session.scenes).lit
         scenes.add(shown, lit)
         drawn = scenes.scene(shown)
@@ -209,7 +231,7 @@ def test_each_gaussian_gets_the_light_of_the_nearest_coarse_one() -> None:
     baked, _ = coarse.merged()
     plain = pasted(coarse, "a sentence")
     # light linear in position: its error is proportional to the distance to the nearest coarse Gaussian
-    lit = upsample_light(replace(plain, shadow=0.5 + 0.1 * baked.means), composite, parts)
+    lit = coarse_draft(replace(plain, shadow=0.5 + 0.1 * baked.means), parts).of_all(composite)
     whole, flags = composite.merged()
     assert torch.equal(lit.gaussians.means, whole.means)
     assert torch.equal(lit.is_object, flags)
@@ -255,8 +277,8 @@ def test_what_drafts_share_is_computed_before_the_first_move(project: Path, monk
         reduced.clear()
         drawn.reset_mock()
         session.undo()
-    assert torch.equal(drafts[0].shadow, drafts[1].shadow)
-    assert torch.equal(drafts[0].shade, drafts[1].shade)
+    assert torch.equal(drafts[0].relit.shadow, drafts[1].relit.shadow)
+    assert torch.equal(drafts[0].relit.shade, drafts[1].relit.shade)
 
 
 @pytest.mark.long

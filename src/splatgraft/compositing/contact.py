@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -22,6 +22,9 @@ from splatgraft.core.bounds import BoundingSphere, bounding_sphere
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.planes import least_squares_normal
 from splatgraft.core.rotations import quaternion_from_rotation
+
+SHAPE = ("means", "log_scales", "quaternions")
+"""Fields of Gaussians that flattening changes."""
 
 # what counts as a contact layer, and how far it is flattened; set by hand on rendered scenes
 _OPAQUE = 0.1  # opacity above which a Gaussian is part of a surface, as for a bounding sphere
@@ -66,12 +69,50 @@ def flatten_contact_layers(target: Gaussians, objects: Sequence[Gaussians]) -> G
     Only centres and shapes near a foot change. All other Gaussians keep every bit. So does the whole target below an
     object that floats or stands on no surface.
     """
-    on_cpu = flattened = target.to("cpu")
+    flattened = target.to("cpu")
+    is_changed = False
     for one in objects:
-        opaque = one.select(one.opacities > _OPAQUE).to("cpu")
-        if opaque.count:
-            flattened = _flattened_under(flattened, _evenly(opaque, _MAX_USED), bounding_sphere(opaque))
-    return target if flattened is on_cpu else flattened.to(target.device)
+        found = flattened_under(flattened, one.to("cpu"))
+        if found is not None:
+            rows, flat = found
+            fields = {name: getattr(flattened, name).index_copy(0, rows, getattr(flat, name)) for name in SHAPE}
+            flattened, is_changed = replace(flattened, **fields), True
+    return flattened.to(target.device) if is_changed else target
+
+
+def flattened_under(target: Gaussians, placed: Gaussians) -> tuple[Int[Tensor, "k"], Gaussians] | None:
+    """Flatten the layer that one object stands on.
+
+    Args:
+        target: Gaussians on the CPU.
+        placed: The object in the target's frame, on the CPU.
+
+    Returns:
+        Indices of the k Gaussians that change, and these Gaussians with new `SHAPE` and the first band of colours
+        alone; None if the object floats or stands on no surface.
+    """
+    opaque = placed.with_sh_degree(0).select(placed.opacities > _OPAQUE)
+    if not opaque.count:
+        return None
+    sphere, opaque = bounding_sphere(opaque), _evenly(opaque, _MAX_USED)
+    away = (target.means - sphere.center).norm(dim=1) - 2 * target.log_scales.amax(1).exp()
+    near = (away < 2 * sphere.radius).nonzero()[:, 0]
+    around = target.with_sh_degree(0).select(near)
+    layer = _contact_layer(around, opaque, sphere)
+    if layer is None:
+        return None
+    if float(layer.heights(sphere.center[None])) < 0:
+        layer = replace(layer, normal=-layer.normal, offset=-layer.offset)
+    heights = layer.heights(opaque.means)
+    base = float((heights - layer.extents(opaque)).min())
+    if base > _DEEPEST * layer.deviation:
+        return None
+    # no hole is dug for an object that was buried on purpose: deeper than the surface's height is uncertain
+    base = max(base, -layer.deviation)
+    foot = opaque.select(heights < base + 0.2 * sphere.radius)
+    factor = _factors(around, foot, layer, radius=sphere.radius)
+    changed = (factor < 1).nonzero()[:, 0]
+    return near[changed], _flattened(around.select(changed), layer, factor[changed], level=min(base, 0.0))
 
 
 def _evenly(gaussians: Gaussians, count: int) -> Gaussians:
@@ -79,38 +120,6 @@ def _evenly(gaussians: Gaussians, count: int) -> Gaussians:
     if gaussians.count <= count:
         return gaussians
     return gaussians.select(torch.linspace(0, gaussians.count - 1, count).long())
-
-
-def _flattened_under(target: Gaussians, opaque: Gaussians, sphere: BoundingSphere) -> Gaussians:
-    away = (target.means - sphere.center).norm(dim=1) - 2 * target.scales.max(1).values
-    near = (away < 2 * sphere.radius).nonzero()[:, 0]
-    around = target.select(near)
-    layer = _contact_layer(around, opaque, sphere)
-    if layer is None:
-        return target
-    if float(layer.heights(sphere.center[None])) < 0:
-        layer = replace(layer, normal=-layer.normal, offset=-layer.offset)
-    heights = layer.heights(opaque.means)
-    base = float((heights - layer.extents(opaque)).min())
-    if base > _DEEPEST * layer.deviation:
-        return target
-    # no hole is dug for an object that was buried on purpose: deeper than the surface's height is uncertain
-    base = max(base, -layer.deviation)
-    foot = opaque.select(heights < base + 0.2 * sphere.radius)
-    factor = _factors(around, foot, layer, radius=sphere.radius)
-    changed = (factor < 1).nonzero()[:, 0]
-    flat = _flattened(around.select(changed), layer, factor[changed], level=min(base, 0.0))
-    rows = near[changed]
-
-    def with_rows(old: Tensor, new: Tensor) -> Tensor:
-        return old.index_copy(0, rows, new)
-
-    return replace(
-        target,
-        means=with_rows(target.means, flat.means),
-        log_scales=with_rows(target.log_scales, flat.log_scales),
-        quaternions=with_rows(target.quaternions, flat.quaternions),
-    )
 
 
 def _distance_from(foot: Gaussians, gaussians: Gaussians, layer: _Layer) -> Float[Tensor, "n"]:

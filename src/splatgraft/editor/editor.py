@@ -262,7 +262,7 @@ class Editor:
                 if KINDS[name] == "photo":
                     parts.append(pictures.draw("photo", state, camera, view.photo)[:, left:right])
                 else:
-                    parts.append(pictures.draw(KINDS[name], state, part, is_dragged=self.live is not None))
+                    parts.append(pictures.draw(KINDS[name], state, part))
         caption = "full quality"
         if kind in ("lit", "shadow") and state.objects:
             stage = pictures.lit.stage(state)

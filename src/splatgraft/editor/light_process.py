@@ -19,7 +19,7 @@ from typing import IO, Any, Literal, get_args
 import torch
 
 from splatgraft.editor.project import Project
-from splatgraft.editor.relit_preview import RelitPreview
+from splatgraft.editor.relit_preview import Draft, RelitPreview
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.session import stamps_of
 from splatgraft.editor.state import EditState
@@ -29,13 +29,16 @@ from splatgraft.relighting import Relit
 Stage = Literal["draft", "refined", "final"]
 Wanted = Literal["prepared", "draft", "final"]
 """Kinds of requests: prepare drafts when idle, compute a draft, or compute a draft and the final light."""
-_START = "import sys; from splatgraft.editor import light_process; light_process.main(sys.argv[1:])"
+_NICE = 10  # priority below that of pictures, also while modules load
+_START = (
+    f"import os, sys; hasattr(os, 'nice') and os.nice({_NICE}); "
+    "from splatgraft.editor import light_process; light_process.main(sys.argv[1:])"
+)
 """Code that the process runs; `python -m` would pickle classes of `__main__`, which the editor cannot load."""
 _FIELDS = ("objects", "erased", "light")
 """Fields of `EditState` on which the light depends."""
 _SETTLE_SECONDS = 0.2  # time without a request before the light starts, which cannot be interrupted
 _REMEMBERED = 500  # stored requests; each picture of a drag makes one, and a draft may take long
-_NICE = 10  # priority below that of pictures
 
 
 @dataclass(frozen=True)
@@ -44,8 +47,8 @@ class Lit:
 
     stage: Stage
     """Draft, all layers with the sources found before a move, or the step's result."""
-    relit: Relit
-    """Layers; a draft omits its Gaussians, which are those of the composite."""
+    layers: Relit | Draft
+    """Layers, without the Gaussians if it is a draft, which are those of the composite."""
     seconds: float
     """Computation time."""
 
@@ -162,7 +165,10 @@ class _Computing:
             return
         start = time.monotonic()
         if self._scenes.files.transfers_light and not self._relighting.is_relit(state):
-            self._send(number, "draft", self._relighting.draft(state), start)
+            draft = self._relighting.draft(state)
+            none = draft.relit.gaussians.select(torch.zeros(0, dtype=torch.int64))
+            sent = replace(_without_evidence(draft.relit), gaussians=none, objects=())
+            self._send(number, "draft", replace(draft, relit=sent), start)
         if wanted == "final":
             self._lights.submit(asked)
 
@@ -171,25 +177,27 @@ class _Computing:
         if not self._lights.wait_idle(_SETTLE_SECONDS) or number != self._number:
             return
         start = time.monotonic()
-        if self._relighting.refine(state):
-            self._send(number, "refined", self._relighting.layers(state, draft=True), start)
+        refined = self._relighting.refined(state)
+        if refined is not None:
+            self._send(number, "refined", _without_evidence(refined), start)
             if number != self._number:
                 return
-        self._send(number, "final", self._relighting.relit(state), start)
+        self._send(number, "final", _without_evidence(self._relighting.relit(state)), start)
         if self._lights.wait_idle(_SETTLE_SECONDS) and number == self._number:
             self._relighting.prepare_drafts(state)
 
-    def _send(self, number: int, stage: Stage, relit: Relit, start: float) -> None:
-        # drop fields that only the step writes, and a draft's Gaussians: none is split, so the editor has them
-        shown = replace(relit, estimate=None, received=(), prepared=())
-        if stage == "draft":
-            shown = replace(shown, gaussians=shown.gaussians.select(torch.zeros(0, dtype=torch.int64)))
+    def _send(self, number: int, stage: Stage, layers: Relit | Draft, start: float) -> None:
         with self._lock:
-            _write(self._out, (number, Lit(stage, shown, time.monotonic() - start)))
+            _write(self._out, (number, Lit(stage, layers, time.monotonic() - start)))
 
     def _failed(self, error: Exception) -> None:
         with self._lock:
             _write(self._out, (self._number, " ".join(str(error).split()) or type(error).__name__))
+
+
+def _without_evidence(relit: Relit) -> Relit:
+    """Drop the fields that only the step writes."""
+    return replace(relit, estimate=None, received=(), prepared=())
 
 
 def main(arguments: list[str]) -> None:
@@ -197,8 +205,6 @@ def main(arguments: list[str]) -> None:
     # printed text must not mix with the answers
     answers, sys.stdout = os.fdopen(os.dup(1), "wb"), sys.stderr
     os.dup2(2, 1)
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
     project = Project(Path(arguments[0]), Path(arguments[1]) if arguments[1] else None)
     computing = _Computing(project, answers)
     while (asked := _read(sys.stdin.buffer)) is not None:

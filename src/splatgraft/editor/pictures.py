@@ -6,16 +6,17 @@ An object that was moved since then keeps its last lit colours, over a contact s
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from splatgraft.compositing.contact import SHAPE, flattened_under
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import read_upright, resize
@@ -24,6 +25,7 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.editor.light_process import Lit
 from splatgraft.editor.memo import Memo
 from splatgraft.editor.photo_view import PhotoView, prompt_of
+from splatgraft.editor.relit_preview import Draft
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState
 from splatgraft.project.gaussian_flags import read_flags
@@ -41,6 +43,7 @@ _LONGEST_PX = 1920  # longer side of a photo; the browser enlarges it on a large
 _DARKEST = 0.5  # largest share of the light that a contact shadow removes
 _SHADOW_WIDTH = 0.35  # width of a contact shadow over the object's radius
 _NO_TURN = 1e-5  # largest deviation of a rotation from the identity by rounding
+_NO_ROWS = torch.zeros(0, dtype=torch.int64)
 _FOOT_SHARE, _FOOT_POINTS = 0.2, 200  # part of an object's height that counts as its foot; number of its points
 
 
@@ -82,6 +85,7 @@ class LitScenes:
         """Start without a lit scene."""
         self._scenes, self._memo, self._lock = scenes, Memo(), threading.RLock()
         self._now: _LitState | None = None
+        self._joined: _JoinedScene | None = None
 
     def add(self, state: EditState, lit: Lit) -> None:
         """Store layers of the light process unless better ones are known."""
@@ -93,9 +97,8 @@ class LitScenes:
                 return
             if now is not None and now.stage == "file" and now.fits(state) and lit.stage != "final":
                 return  # the finished result stays
-            relit = lit.relit
-            if len(relit.is_object) != relit.gaussians.count:
-                relit = replace(relit, gaussians=self._scenes.composite(state).merged()[0])
+            layers = lit.layers
+            relit = layers.of_all(self._scenes.composite(state)) if isinstance(layers, Draft) else layers
             self._now = _LitState(state, lit.stage, relit)
 
     def adopt(self, state: EditState) -> None:
@@ -118,14 +121,15 @@ class LitScenes:
         now = self._now
         return now.relit if now is not None and now.fits(state) else None
 
-    def scene(self, state: EditState, *, is_dragged: bool = False) -> Gaussians:
-        """Return a state's scene with the newest colours; in a drag the support is not flattened under objects."""
+    def scene(self, state: EditState) -> Gaussians:
+        """Return a state's scene with the newest colours; after a move it is valid until the next call."""
         now = self._now
         if not self._scenes.files.transfers_light or not state.objects:
             return self.pasted(state)
         if now is not None and now.stands_as(state):
             return self._baked(now, state.weights)[0]
-        return self._moved(now, state, self.place(state) if is_dragged else self._flattened(state))
+        inputs = (now, self.place(state), state.objects, state.weights)
+        return self._memo.get("moved", inputs, lambda: self._moved(now, state))
 
     def pasted(self, state: EditState) -> Gaussians:
         """Return the scene that the step `compose` writes."""
@@ -156,15 +160,9 @@ class LitScenes:
             return lit.baked
         return self._memo.get("baked", (relit, weights), lambda: relit.bake(weights))
 
-    def _flattened(self, state: EditState) -> Gaussians:
-        """Return the target, flattened under the objects; this takes longer than a picture."""
-        composite = self._scenes.composite(state)
-        count = composite.kept_count
-        return self._memo.get("flattened", (composite,), lambda: composite.merged()[0].map(lambda rows: rows[:count]))
-
-    def _moved(self, lit: _LitState | None, state: EditState, place: Gaussians) -> Gaussians:
+    def _moved(self, lit: _LitState | None, state: EditState) -> Gaussians:
         """Return the scene with the last lit objects moved to new placements."""
-        objects = list(state.objects or ())
+        objects, place = list(state.objects or ()), self.place(state)
         parts = self._lit_objects(lit, state.weights) if lit is not None else {}
         moved, feet = [], []
         for index, item in enumerate(objects):
@@ -177,10 +175,9 @@ class LitScenes:
             else:
                 moved.append(move.gaussians(self._scenes.gaussians(path)))
             feet.append((move.points(self._foot(item)), move.scale * self._scenes.placeable_object(item).base.radius))
-        scene = concatenate([place, *moved])
-        for points, radius in feet:
-            _darken(scene.sh, place, points, radius)  # in place, because the scene is new
-        return scene
+        if self._joined is None or not self._joined.holds(place, moved):
+            self._joined = _JoinedScene(place, moved)
+        return self._joined.at(moved, feet)
 
     def _lit_objects(self, lit: _LitState, weights: LayerWeights) -> dict[int, tuple[object, Similarity, Gaussians]]:
         """Return the lit objects in the target's frame, with file and placement, by number."""
@@ -210,6 +207,42 @@ class LitScenes:
         return self._scenes.derive(f"foot {self._scenes.object_path(item)}", (one,), make)
 
 
+class _JoinedScene:
+    """A place with objects in one scene, of which a move changes only the objects and what is near their feet."""
+
+    def __init__(self, place: Gaussians, objects: Sequence[Gaussians]) -> None:
+        self._place, self._scene = place, concatenate([place, *objects])
+        self._padded = place.with_sh_degree(self._scene.sh_degree)
+        self._flattened = self._darkened = _NO_ROWS
+
+    def holds(self, place: Gaussians, objects: Sequence[Gaussians]) -> bool:
+        """Return whether this is the scene of a place and of as many Gaussians of objects."""
+        degree = max(one.sh_degree for one in (place, *objects))
+        count = place.count + sum(one.count for one in objects)
+        return place is self._place and self._scene.count == count and self._scene.sh_degree == degree
+
+    def at(self, objects: Sequence[Gaussians], feet: Sequence[tuple[Float[Tensor, "m 3"], float]]) -> Gaussians:
+        """Replace the objects, flatten the support under them, and draw contact shadows of their feet."""
+        place, scene, count = self._place, self._scene, self._place.count
+        scene.sh[self._darkened] = self._padded.sh[self._darkened]
+        for name in SHAPE:
+            getattr(scene, name)[self._flattened] = getattr(place, name)[self._flattened]
+        joined = concatenate(objects).with_sh_degree(scene.sh_degree)
+        for field in fields(Gaussians):
+            getattr(scene, field.name)[count:] = getattr(joined, field.name)
+        around, flattened, darkened = scene.map(lambda rows: rows[:count]), [], []
+        for one, (points, radius) in zip(objects, feet, strict=True):
+            found = flattened_under(around, one)
+            if found is not None:
+                rows, flat = found
+                flattened.append(rows)
+                for name in SHAPE:
+                    getattr(scene, name)[rows] = getattr(flat, name)
+            darkened.append(_darken(scene.sh, place, points, radius))
+        self._flattened, self._darkened = torch.cat([_NO_ROWS, *flattened]), torch.cat([_NO_ROWS, *darkened])
+        return scene
+
+
 def _moved_by(move: Similarity, gaussians: Gaussians) -> Gaussians:
     """Move Gaussians; the slow rotation of colours is skipped if the move has no rotation."""
     if float((move.rotation - torch.eye(3)).abs().max()) > _NO_TURN:
@@ -222,17 +255,21 @@ def _same_weights(a: EditState, b: EditState) -> bool:
     return a.weights == b.weights
 
 
-def _darken(sh: Float[Tensor, "n k 3"], place: Gaussians, foot: Float[Tensor, "m 3"], radius: float) -> None:
-    """Darken the colours of a place, the first rows of `sh`, by a contact shadow that fades away from the foot."""
+def _darken(
+    sh: Float[Tensor, "n k 3"], place: Gaussians, foot: Float[Tensor, "m 3"], radius: float
+) -> Int[Tensor, "k"]:
+    """Darken colours of a place, the first rows of `sh`, by a shadow around the foot; return the changed rows."""
     width = _SHADOW_WIDTH * radius
     middle = foot.mean(0)
     reach = float((foot - middle).norm(dim=1).max()) + 2 * width
     near = ((place.means - middle).abs().amax(1) < reach).nonzero()[:, 0]
     if not len(near):
-        return
+        return near
     apart = torch.from_numpy(KDTree(foot.numpy()).query(place.means[near].numpy())[0]).float()
     gain = 1 - _DARKEST * torch.exp(-((apart / max(width, 1e-9)) ** 2))
-    sh[near] = apply_gain(replace(place.select(near), sh=sh[near]), gain[:, None].expand(-1, 3)).sh
+    colors = replace(place.with_sh_degree(0).select(near), sh=sh[near])
+    sh[near] = apply_gain(colors, gain[:, None].expand(-1, 3)).sh
+    return near
 
 
 class Pictures:
@@ -241,18 +278,22 @@ class Pictures:
     def __init__(self, scenes: SceneCache) -> None:
         """Start without a lit scene."""
         self._scenes, self.lit, self._memo = scenes, LitScenes(scenes), Memo()
+        self._drawing = threading.Lock()
 
     def draw(
-        self, kind: Kind, state: EditState, camera: Cameras, photo: int | None = None, *, is_dragged: bool = False
+        self, kind: Kind, state: EditState, camera: Cameras, photo: int | None = None
     ) -> UInt8[np.ndarray, "h w 3"]:
         """Draw the target; raise ValueError if an input does not exist yet."""
         if kind == "photo":
             return self._target_photo(camera, photo)
         if kind == "shadow":
             return self._shadow(state, camera)
-        return draw(self.lit.scene(state, is_dragged=is_dragged) if kind == "lit" else self._scene(kind, state), camera)
+        with self._drawing:  # a moved scene is valid until the next one is made
+            return draw(self._scene(kind, state), camera)
 
     def _scene(self, kind: Kind, state: EditState) -> Gaussians:
+        if kind == "lit":
+            return self.lit.scene(state)
         if kind == "result":
             if not self._scenes.files.result.is_file():
                 raise ValueError("There is no result yet: press Update result in Run.")

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Int
@@ -23,6 +23,7 @@ from splatgraft.editor.state import EditState
 from splatgraft.editor.transfer_values import TransferValues
 from splatgraft.relighting import Relit, SourceScene
 
+T = TypeVar("T")
 TARGET_BUDGET, OBJECT_BUDGET = 30_000, 8_000
 """Numbers of Gaussians; relighting this many after a change of the light takes about a second on one core."""
 
@@ -46,32 +47,37 @@ def coarsen(gaussians: Gaussians, budget: int) -> CoarseGaussians:
     return CoarseGaussians(subset, torch.from_numpy(nearest).long())
 
 
-def upsample_light(relit: Relit, composite: Composite, parts: Sequence[CoarseGaussians]) -> Relit:
-    """Copy the layers of a relit coarse composite to all Gaussians of `composite`, from the nearest coarse Gaussian.
+@dataclass(frozen=True)
+class Draft:
+    """Light of a coarse composite, and its use for all Gaussians."""
 
-    `parts` are the coarse target without erased Gaussians, and the coarse objects; no Gaussian is split.
-    """
+    relit: Relit
+    """Layers of the m coarse Gaussians."""
+    nearest: Int[Tensor, "n"]
+    """Index of the coarse Gaussian whose layers each of the composite's n Gaussians gets; none is split."""
+
+    def of_all(self, composite: Composite) -> Relit:
+        """Copy the layers to all Gaussians of `composite`."""
+        gaussians, is_object = composite.merged()
+        names = ("shade", "shadow", "bounce", "slope", "gloss", "bands_replaced")
+        return replace(
+            self.relit,
+            gaussians=gaussians,
+            is_object=is_object,
+            origin=torch.arange(gaussians.count),
+            objects=tuple(placed.in_target() for placed in composite.objects),
+            **{name: getattr(self.relit, name)[self.nearest] for name in names},
+        )
+
+
+def coarse_draft(relit: Relit, parts: Sequence[CoarseGaussians]) -> Draft:
+    """Return the draft of a scene from the light of its coarse target, without erased Gaussians, and coarse objects."""
     counts = [part.gaussians.count for part in parts]
     assert relit.gaussians.count == sum(counts)
     starts = torch.tensor([0, *counts[:-1]]).cumsum(0).tolist()
-    row = torch.cat([part.nearest + start for part, start in zip(parts, starts, strict=True)])
-    gaussians, is_object = composite.merged()
-    return Relit(
-        gaussians=gaussians,
-        is_object=is_object,
-        origin=torch.arange(gaussians.count),
-        shade=relit.shade[row],
-        shadow=relit.shadow[row],
-        bounce=relit.bounce[row],
-        # valid over the width of a coarse Gaussian only
-        slope=relit.slope.new_zeros(len(row), *relit.slope.shape[1:]),
-        # a coarse composite has none
-        gloss=relit.gloss[row],
-        bands_replaced=relit.bands_replaced[row],
-        objects=tuple(placed.in_target() for placed in composite.objects),
-        light=relit.light,
-        report=relit.report,
-    )
+    nearest = torch.cat([part.nearest + start for part, start in zip(parts, starts, strict=True)])
+    # slopes are valid over the width of a coarse Gaussian only
+    return Draft(replace(relit, slope=torch.zeros_like(relit.slope)), nearest)
 
 
 def largest_coverage_indices(gaussians: Gaussians, budget: int) -> Int[Tensor, "m"]:
@@ -97,12 +103,6 @@ class RelitPreview:
         """Return whether this state's light is memoised, or project.toml selects no physical light transfer."""
         return not self._scenes.files.transfers_light or self._memo.peek("relit", self._inputs(state)) is not None
 
-    def best(self, state: EditState) -> Relit | None:
-        """Return the best memoised result of this state: the light, a refined draft, a draft, or None."""
-        inputs = self._inputs(state)
-        found = (self._memo.peek(name, inputs) for name in ("relit", "refined", "draft"))
-        return next((relit for relit in found if relit is not None), None)
-
     def relit(self, state: EditState) -> Relit:
         """Compute the layers of this state's full light transfer, as the step does."""
 
@@ -114,19 +114,18 @@ class RelitPreview:
 
         return self._make_once("relit", state, make, lock=self._full_lock)
 
-    def refine(self, state: EditState) -> bool:
+    def refined(self, state: EditState) -> Relit | None:
         """Compute all layers at full detail after a move, with the light sources estimated before it.
 
-        This takes less time than `relit`. Return False if nothing was moved or these layers exist already.
+        This takes less time than `relit`. Return None if nothing was moved or these layers exist already.
         """
         options, composite = self._scenes.files.relight_options, self._scenes.composite(state)
         is_moved = self._full_values.is_moved(composite, self._cameras(), state.light, options)
         if not is_moved or self._memo.peek("refined", self._inputs(state)) is not None:
-            return False
-        self._make_once("refined", state, lambda: self._transfer(state, exact=False), lock=self._full_lock)
-        return True
+            return None
+        return self._make_once("refined", state, lambda: self._transfer(state, exact=False), lock=self._full_lock)
 
-    def draft(self, state: EditState) -> Relit:
+    def draft(self, state: EditState) -> Draft:
         """Compute a draft with coarse shadow edges; the first draft omits the light of the source scene."""
         # a draft must not wait for the final light; for a small scene both share the transfer's values
         lock = self._draft_lock if _is_large(self._scenes.composite(state)) else self._full_lock
@@ -140,13 +139,9 @@ class RelitPreview:
                 shared = (composite.target, composite.erased, *sources)
                 self._memo.get("drafts prepared", shared, lambda: self._draft(state, with_sources=True))
 
-    def layers(self, state: EditState, *, draft: bool) -> Relit:
-        """Return the layers of the light transfer, or their best draft."""
-        return (self.best(state) or self.draft(state)) if draft else self.relit(state)
-
     def _make_once(
-        self, name: str, state: EditState, make: Callable[[], Relit], *, lock: AbstractContextManager[object]
-    ) -> Relit:
+        self, name: str, state: EditState, make: Callable[[], T], *, lock: AbstractContextManager[object]
+    ) -> T:
         inputs = self._inputs(state)
         # a memoised result must not wait for a computation in another thread
         found = self._memo.peek(name, inputs)
@@ -168,7 +163,7 @@ class RelitPreview:
             exact=exact,
         )
 
-    def _draft(self, state: EditState, *, with_sources: bool = False) -> Relit:
+    def _draft(self, state: EditState, *, with_sources: bool = False) -> Draft:
         composite = self._scenes.composite(state)
         sources: list[SourceScene | None] = list(self._scenes.source_scenes(state))
         if not (with_sources or self._memo.has("relit") or self._memo.has("drafts prepared")):
@@ -199,7 +194,7 @@ class RelitPreview:
             )
         options = replace(self._scenes.files.relight_options, most_added=0.0, fitted_views=0)
         relit = values.relight(drawn, self._cameras(), sources=sources, light=state.light, options=options, exact=False)
-        return upsample_light(relit, composite, parts) if parts else relit
+        return coarse_draft(relit, parts) if parts else Draft(relit, torch.arange(relit.gaussians.count))
 
     def _cameras(self) -> Cameras:
         return self._scenes.cameras(self._scenes.files.target_cameras)

@@ -286,13 +286,17 @@ def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Ten
 
 
 def _gloss_layer(gaussians: Gaussians, shadings: Sequence[_Shading]) -> Float[Tensor, "m k 3"]:
-    """Assemble the gloss layer of all m Gaussians, the objects' last; its degree is 3 if something is glossy."""
+    """Assemble the gloss layer of all m Gaussians, the objects' last; its degree is 0 if nothing is glossy, else 3."""
     if all(one.gloss is None for one in shadings):
-        return torch.zeros_like(gaussians.sh)
+        return _no_gloss(gaussians)
     count = spherical_harmonics.coefficient_count(spherical_harmonics.MAX_DEGREE)
     on_objects = [torch.zeros(len(one.shade), count, 3) if one.gloss is None else one.gloss for one in shadings]
     on_scene = torch.zeros(gaussians.count - sum(map(len, on_objects)), count, 3)
     return torch.cat([on_scene, *on_objects])
+
+
+def _no_gloss(gaussians: Gaussians) -> Float[Tensor, "m 1 3"]:
+    return torch.zeros_like(gaussians.sh[:, :1])
 
 
 def pasted(composite: Composite, reason: str) -> Relit:
@@ -307,7 +311,7 @@ def pasted(composite: Composite, reason: str) -> Relit:
         shadow=ones,
         bounce=torch.zeros_like(ones),
         slope=torch.zeros_like(ones),
-        gloss=torch.zeros_like(gaussians.sh),
+        gloss=_no_gloss(gaussians),
         bands_replaced=torch.zeros(gaussians.count, dtype=torch.bool),
         objects=tuple(placed.in_target() for placed in composite.objects if placed.gaussians.count),
         light=None,
