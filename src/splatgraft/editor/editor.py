@@ -1,6 +1,7 @@
 """The open project with its steps and windows, and the handling of the messages that `Server` receives."""
 
 import contextlib
+import filecmp
 import json
 import queue
 import re
@@ -597,19 +598,8 @@ class Editor:
 
     def uploaded(self, path: Path, use: str) -> None:
         """Use an uploaded file, or an identical earlier one."""
-        twins = [
-            one
-            for one in sorted(path.parent.glob(f"{re.sub(r'_[0-9]+$', '', path.stem)}*{path.suffix}"))
-            if one != path
-        ]
-        twin = next(
-            (
-                one
-                for one in twins
-                if one.stat().st_size == path.stat().st_size and one.read_bytes() == path.read_bytes()
-            ),
-            None,
-        )
+        alike = sorted(path.parent.glob(f"{re.sub(r'_[0-9]+$', '', path.stem)}*{path.suffix}"))
+        twin = next((one for one in alike if one != path and filecmp.cmp(one, path, shallow=False)), None)
         if twin is not None:
             path.unlink()
         with self.lock:

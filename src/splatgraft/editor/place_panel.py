@@ -8,27 +8,28 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.drag import Drag, DragMode, outline
 from splatgraft.editor.form import Form
+from splatgraft.editor.memo import Memo
 from splatgraft.editor.panel import CORNERS, BoxDrag, Panel, Pointer, box_over, view_camera
 from splatgraft.editor.pictures import same_places
 from splatgraft.editor.placement import (
-    Gizmo,
     ObjectSize,
     align_up,
-    degrees_from_quaternion,
+    degrees_of,
     drop_to_surface,
-    gizmo_from_similarity,
     place_beside,
     plausible_scale,
-    quaternion_from_degrees,
     rescale,
-    similarity_from_gizmo,
+    rotation_of,
     snapped_angles,
     suggest_placement,
+    with_base,
 )
 from splatgraft.editor.session import Session
 from splatgraft.editor.sky_dome import SkyDome
@@ -59,6 +60,7 @@ class PlacePanel(Panel):
         self._drag: tuple[int, DragMode, tuple[float, float], Drag] | None = None
         self._box: Box | None = None
         self._held_box: BoxDrag | None = None
+        self._solid = Memo()
 
     def enter(self) -> None:
         """Show the new light instead of the result."""
@@ -113,7 +115,7 @@ class PlacePanel(Panel):
             form.choice(
                 "object", "Object", names[self._chosen], names, lambda v: setattr(self, "_chosen", names.index(v))
             )
-        scale = self._gizmo(session).scale
+        scale = objects[self._chosen].target_from_object.scale
         form.numbers(
             "scale", "Scale", [scale], lambda v: self._typed(scale=v[0]), hint="Over its size in its own photos"
         )
@@ -123,10 +125,10 @@ class PlacePanel(Panel):
         form.note("Drag it along its support; with Alt onto another one.", name="hint", faint=True)
 
     def _build_numbers(self, form: Form, session: Session) -> None:
-        gizmo = self._gizmo(session)
-        form.numbers("position", "Position", gizmo.position, lambda v: self._typed(position=v))
+        placed = session.objects()[self._chosen].target_from_object
+        form.numbers("position", "Position", self._base(session).tolist(), lambda v: self._typed(position=v))
         # rounded for display, without -0; typed numbers are used exactly
-        angles = [round(angle, 2) + 0.0 for angle in degrees_from_quaternion(gizmo.wxyz)]
+        angles = [round(angle, 2) + 0.0 for angle in degrees_of(placed.rotation)]
         form.numbers(
             "rotation", "Rotation", angles, lambda v: self._typed(degrees=v), step=0.01, hint="Degrees about x, y, z"
         )
@@ -164,24 +166,21 @@ class PlacePanel(Panel):
 
     # placement by numbers and operations
 
-    def _gizmo(self, session: Session) -> Gizmo:
-        item = session.objects()[self._chosen]
-        return gizmo_from_similarity(item.target_from_object, session.placeable_object(self._chosen).base.point)
+    def _base(self, session: Session) -> Float[Tensor, "3"]:
+        """Return the chosen object's base point in the target."""
+        placed = session.objects()[self._chosen].target_from_object
+        return placed.points(session.placeable_object(self._chosen).base.point)
 
     def _typed(self, *, position: Any = None, degrees: Any = None, scale: float | None = None) -> None:
         session = self.editor.require_session()
-        gizmo = self._gizmo(session)
-        if degrees is not None:
-            check_numbers(degrees, "rotation")
-        made = Gizmo(
-            gizmo.position if position is None else position,
-            gizmo.wxyz if degrees is None else quaternion_from_degrees(degrees),
-            gizmo.scale if scale is None else scale,
-        )
-        check_numbers((*made.position, made.scale), "position, scale")
-        if made.scale <= 0:
-            raise ValueError(f"scale: expected a number above 0, found {made.scale:g}")
-        self._place(similarity_from_gizmo(made, session.placeable_object(self._chosen).base.point))
+        item, placed = session.placeable_object(self._chosen), session.objects()[self._chosen].target_from_object
+        check_numbers(degrees or (), "rotation")
+        check_numbers((*(position or ()), placed.scale if scale is None else scale), "position, scale")
+        if scale is not None and scale <= 0:
+            raise ValueError(f"scale: expected a number above 0, found {scale:g}")
+        at = self._base(session) if position is None else torch.tensor(position)
+        rotation = placed.rotation if degrees is None else rotation_of(degrees)
+        self._place(with_base(item, Similarity(scale or placed.scale, rotation, placed.translation), at=at))
 
     def _place(self, target_from_object: Similarity) -> None:
         self.editor.require_session().set_placement(self._chosen, target_from_object)
@@ -308,12 +307,10 @@ class PlacePanel(Panel):
         items = self.editor.shown_state().objects or ()
         hulls = []
         for item in items:
-            # without its base, which takes longer to find than the first picture
+            # without the object's base and the scenes' memo, for which the first picture would wait
             path = session.scenes.object_path(item)
             one = session.scenes.gaussians(path)
-            solid = session.scenes.derive(
-                f"solid {path}", (one,), lambda one=one: one.means[one.opacities > _MIN_OPACITY]
-            )
+            solid = self._solid.get(str(path), (one,), lambda one=one: one.means[one.opacities > _MIN_OPACITY])
             hulls.append(outline(item.target_from_object.points(solid), camera))
         over: dict[str, Any] = {"hulls": hulls, "chosen": self._chosen if len(items) > 1 else -1}
         if self._box is not None:
@@ -357,9 +354,9 @@ class PlacePanel(Panel):
             return
         placed = held.at(mode, start, pointer.place, anywhere=pointer.alt)
         if mode == "turn" and self._snaps:
-            gizmo = gizmo_from_similarity(placed, held.item.base.point)
-            angles = snapped_angles(degrees_from_quaternion(gizmo.wxyz), _SNAP_DEGREES)
-            placed = similarity_from_gizmo(replace(gizmo, wxyz=quaternion_from_degrees(angles)), held.item.base.point)
+            turned = rotation_of(snapped_angles(degrees_of(placed.rotation), _SNAP_DEGREES))
+            foot = placed.points(held.item.base.point)
+            placed = with_base(held.item, replace(placed, rotation=turned), at=foot)
         item = replace(session.objects()[index], target_from_object=placed)
         edited = session.placed_state().with_object(index, item)
         check_state(edited)
@@ -387,7 +384,7 @@ class PlacePanel(Panel):
     def _toggle_box(self, value: bool) -> None:
         session, half = self.editor.require_session(), 0.25 * self.editor.scene_scale()
         target = session.scenes.gaussians(session.files.target_scene)
-        centre = torch.tensor(self._gizmo(session).position) if session.objects() else target.means.median(0).values
+        centre = self._base(session) if session.objects() else target.means.median(0).values
         self._box = Box(centre - half, centre + half) if value else None
 
     def _erase(self) -> None:

@@ -1,4 +1,4 @@
-"""An object's placement: its gizmo and size, and operations such as drop, upright, rescale and duplicate."""
+"""An object's placement: its angles and size, and operations such as drop, upright, rescale and duplicate."""
 
 import math
 import warnings
@@ -14,7 +14,7 @@ from splatgraft.composition import NoFreePlaceError, ObjectBase, Placed, PlaceOp
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.rotations import quaternion_from_rotation, rotation_between, rotation_from_quaternion
+from splatgraft.core.rotations import rotation_between
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.state import check_height_cm
 from splatgraft.project.metric_scale import MetricScale
@@ -33,44 +33,16 @@ _SAME_HEIGHT = 0.15
 """Largest height difference of places on one surface, over the object's height."""
 
 
-@dataclass(frozen=True)
-class Gizmo:
-    """Pose and scale of the transform gizmo, which is shown at the object's pivot."""
-
-    position: Triple
-    """Position of the pivot in the target, world units."""
-    wxyz: tuple[float, float, float, float]
-    """Rotation from the object's to the target's axes."""
-    scale: float
-    """Size in the target over size in the object's capture."""
-
-
-def gizmo_from_similarity(target_from_object: Similarity, pivot: Float[Tensor, "3"]) -> Gizmo:
-    """Return the gizmo of an object placed by `target_from_object`, at `pivot` in the object's frame."""
-    w, i, j, k = quaternion_from_rotation(target_from_object.rotation[None])[0].tolist()
-    x, y, z = target_from_object.points(pivot).tolist()
-    return Gizmo((x, y, z), (w, i, j, k), target_from_object.scale)
-
-
-def similarity_from_gizmo(gizmo: Gizmo, pivot: Float[Tensor, "3"]) -> Similarity:
-    """Return the placement that puts `pivot` at the gizmo."""
-    rotation = rotation_from_quaternion(torch.tensor([gizmo.wxyz], dtype=torch.float64))[0]
-    translation = torch.tensor(gizmo.position, dtype=torch.float64) - gizmo.scale * rotation @ pivot.double()
-    return Similarity(scale=gizmo.scale, rotation=rotation.float(), translation=translation.float())
-
-
-def degrees_from_quaternion(wxyz: tuple[float, float, float, float]) -> Triple:
-    """Return rotation angles about the fixed x, then y, then z axis, in degrees."""
-    w, i, j, k = wxyz
+def degrees_of(rotation: Float[Tensor, "3 3"]) -> Triple:
+    """Return the angles of a rotation about the fixed x, then y, then z axis, in degrees."""
     with warnings.catch_warnings(action="ignore"):  # gimbal lock: any of the valid triples will do
-        x, y, z = Rotation.from_quat([i, j, k, w]).as_euler("xyz", degrees=True).tolist()
+        x, y, z = Rotation.from_matrix(rotation.double().numpy()).as_euler("xyz", degrees=True).tolist()
     return x, y, z
 
 
-def quaternion_from_degrees(degrees: Triple) -> tuple[float, float, float, float]:
-    """Return the quaternion wxyz of rotations about the fixed x, then y, then z axis, in degrees."""
-    i, j, k, w = Rotation.from_euler("xyz", degrees, degrees=True).as_quat().tolist()
-    return w, i, j, k
+def rotation_of(degrees: Triple) -> Float[Tensor, "3 3"]:
+    """Return the rotation about the fixed x, then y, then z axis, by angles in degrees."""
+    return torch.from_numpy(Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()).float()
 
 
 @dataclass(frozen=True)
@@ -153,12 +125,20 @@ def align_up(item: PlaceableObject, target_from_object: Similarity, *, up: Float
     """Apply the smallest rotation that aligns the object's up with `up`; the base point stays fixed."""
     up = torch.nn.functional.normalize(up, dim=0)
     rotation = rotation_between(target_from_object.rotation @ item.base.up, up) @ target_from_object.rotation
-    return _about_base_point(item, target_from_object, rotation=rotation, scale=target_from_object.scale)
+    return with_base(
+        item, replace(target_from_object, rotation=rotation), at=target_from_object.points(item.base.point)
+    )
 
 
 def rescale(item: PlaceableObject, target_from_object: Similarity, scale: float) -> Similarity:
     """Set the scale; the base point stays fixed."""
-    return _about_base_point(item, target_from_object, rotation=target_from_object.rotation, scale=scale)
+    return with_base(item, replace(target_from_object, scale=scale), at=target_from_object.points(item.base.point))
+
+
+def with_base(item: PlaceableObject, target_from_object: Similarity, *, at: Float[Tensor, "3"]) -> Similarity:
+    """Move the object so that its base point is at a point of the target."""
+    offset = target_from_object.scale * target_from_object.rotation @ item.base.point
+    return replace(target_from_object, translation=at - offset)
 
 
 def plausible_scale(
@@ -219,13 +199,6 @@ def _reach(item: PlaceableObject) -> float:
 
 def _shifted(target_from_object: Similarity, shift: Float[Tensor, "3"]) -> Similarity:
     return replace(target_from_object, translation=target_from_object.translation + shift)
-
-
-def _about_base_point(
-    item: PlaceableObject, target_from_object: Similarity, *, rotation: Float[Tensor, "3 3"], scale: float
-) -> Similarity:
-    base_point = target_from_object.points(item.base.point)
-    return Similarity(scale=scale, rotation=rotation, translation=base_point - scale * rotation @ item.base.point)
 
 
 def _twist_about(rotation: Float[Tensor, "3 3"], axis: Float[Tensor, "3"]) -> float:

@@ -27,11 +27,6 @@ class LatestOnlyWorker(Generic[T]):
             self._wake.notify()
 
     @property
-    def superseded(self) -> bool:
-        """Whether a newer request waits; long work may stop then."""
-        return bool(self._waiting)
-
-    @property
     def closed(self) -> bool:
         """Whether the worker was closed; the target of its output may be gone."""
         return not self._open

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 from torch import Tensor
 
@@ -112,6 +111,9 @@ class _Cells:
 
     def interpolated_depth(self, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, "k"]:
         """Interpolate inverse depth over the Delaunay triangles of the nearest points; infinite outside of them."""
+        # imported here, because it loads slowly, and all that reads a project imports this module
+        from scipy.interpolate import LinearNDInterpolator
+
         corners = self.nearest[self.nearest >= 0]
         nowhere = torch.full((len(pixels),), torch.inf)
         if len(corners) < 3:
