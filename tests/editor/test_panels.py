@@ -5,6 +5,7 @@ import math
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from waiting import wait_until
 
 from splatgraft.cli import main
 from splatgraft.editor.editor import Editor
+from splatgraft.editor.light_process import Lit
 from splatgraft.editor.project import Project
+from splatgraft.editor.relit_preview import RelitPreview
 from splatgraft.editor.session import Session
 from splatgraft.editor.state_files import read_state
 from splatgraft.project.metric_scale import MetricScale, read_scale, write_scale
@@ -310,14 +313,15 @@ def test_clicks_preview_an_outline_and_alt_marks_the_background(finished_project
         assert not window.head["problem"]
 
 
-def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(project: Path) -> None:
+def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # the process starts for seconds; test_view.py waits for it
+    monkeypatch.setattr("splatgraft.editor.editor.LightProcess", MagicMock())
     with opened_editor(project) as editor, Client(editor.server.port).window(size=(160, 120)) as window:
         session, pictures = editor.require_session(), editor.pictures
         assert pictures is not None
+        relit = RelitPreview(session.scenes).relit(session.placed_state())
+        pictures.lit.add(session.placed_state(), Lit("final", relit, 0.0))
         window.step("Light")
-        window.wait(lambda: pictures.lit.stage(session.placed_state()) == "final", what="the light")
-        relit = pictures.lit.relit(session.placed_state())
-        assert relit is not None
         assert {name: window.control(name).get("value", 0.0) for name in asdict(LayerWeights())} == asdict(
             LayerWeights()
         )

@@ -30,7 +30,7 @@ from splatgraft.editor.state import EditState
 from splatgraft.editor.transfer_values import TransferValues
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.project.toml_edit import with_keys
-from splatgraft.relighting import LayerWeights, Light, RelightOptions, SourceScene
+from splatgraft.relighting import LayerWeights, Light, RelightOptions, Relit, SourceScene
 from splatgraft.relighting.layers import pasted
 
 
@@ -50,7 +50,14 @@ def session(lit: Path, tmp_path: Path) -> Session:
     return Session(Project(copy_of(lit, tmp_path) / "project.toml"))
 
 
-def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Session) -> None:
+@pytest.fixture(scope="module")
+def light(lit: Path, tmp_path_factory: pytest.TempPathFactory) -> Relit:
+    """Compute the light of that project once; it does not depend on paths."""
+    session = Session(Project(copy_of(lit, tmp_path_factory.mktemp("light")) / "project.toml"))
+    return RelitPreview(session.scenes).relit(session.placed_state())
+
+
+def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Session, light: Relit) -> None:
     state, pictures = session.placed_state(), Pictures(session.scenes)
     camera = session.scenes.cameras(session.files.target_cameras)[0]
     refused = {"result": "no result yet", "shadow": "being computed"}
@@ -62,21 +69,21 @@ def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Ses
         picture = pictures.draw(kind, state, camera, 0)
         assert picture.shape == (camera.height, camera.width, 3)
         assert picture.std() > 1, kind
-    relit = RelitPreview(session.scenes).relit(state)
-    pictures.lit.add(state, Lit("final", relit, 0.0))
+    pictures.lit.add(state, Lit("final", light, 0.0))
     assert pictures.draw("shadow", state, camera).std() > 1
     assert pictures.lit.stage(state) == "final"
     # a draft that comes late does not replace it
-    pictures.lit.add(state, Lit("draft", relit, 0.0))
+    pictures.lit.add(state, Lit("draft", light, 0.0))
     assert pictures.lit.stage(state) == "final"
     assert pictures.lit.stage(moved(state)) == ""
 
 
-def test_a_moved_object_keeps_its_colours_over_a_contact_shadow_until_its_light_is_there(session: Session) -> None:
+def test_a_moved_object_keeps_its_colours_over_a_contact_shadow_until_its_light_is_there(
+    session: Session, light: Relit
+) -> None:
     lit, state = Pictures(session.scenes).lit, session.placed_state()
-    relit = RelitPreview(session.scenes).relit(state)
-    lit.add(state, Lit("final", relit, 0.0))
-    before, is_object = relit.bake(state.weights)
+    lit.add(state, Lit("final", light, 0.0))
+    before, is_object = light.bake(state.weights)
     assert lit.scene(state) is lit.scene(state)
     assert torch.equal(lit.scene(state).sh, before.sh)
     placed = session.objects()[0].target_from_object
