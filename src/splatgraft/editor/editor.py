@@ -536,6 +536,8 @@ class Editor:
         """Switch to another step."""
         self.panels[self.step].leave()
         self.live, self.step = None, step
+        if step in ("Place", "Light") and self.kind == "Result":
+            self.kind = "With its new light"
         self.say("")
         for view in self.stream.views:
             view.photo = None if self.side == "target" else 0

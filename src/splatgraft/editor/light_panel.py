@@ -61,11 +61,6 @@ class LightPanel(Panel):
         """Orientation of the picture of the sky."""
         self._handle: tuple[int, Corner] | None = None
 
-    def enter(self) -> None:
-        """Show the new light instead of the result."""
-        if self.editor.kind == "Result":
-            self.editor.kind = "With its new light"
-
     def leave(self) -> None:
         """End drags and clicks for the sun."""
         self._sets_sun, self._handle = False, None

@@ -62,11 +62,6 @@ class PlacePanel(Panel):
         self._held_box: BoxDrag | None = None
         self._solid = Memo()
 
-    def enter(self) -> None:
-        """Show the new light instead of the result."""
-        if self.editor.kind == "Result":
-            self.editor.kind = "With its new light"
-
     def leave(self) -> None:
         """End drags and remove the box."""
         self._drag = self._box = self._held_box = None
