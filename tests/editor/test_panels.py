@@ -345,6 +345,25 @@ def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(project: Path, m
         wait_until(lambda: "exposure" not in session.files.file.read_text(), what="no key for what is as computed")
 
 
+def test_drafts_of_a_finished_light_are_prepared_once_the_view_rests(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = MagicMock(is_started=False)
+    monkeypatch.setattr("splatgraft.editor.editor.LightProcess", MagicMock(return_value=process))
+    monkeypatch.setattr("splatgraft.editor.pictures.LitScenes.stage", lambda *_: "file")
+    sent = []
+    with opened_editor(project) as editor, Client(editor.server.port).window(size=(160, 120)) as window:
+        process.want.side_effect = lambda state, wanted: sent.append((wanted, editor.stream.views[0].sent > 0))
+        window.wait(lambda: bool(sent), what="the preparation")
+        # a process that has ended starts again by an action alone
+        process.is_started = True
+        with editor.lock:
+            count = len(sent)
+            editor.poll()
+            assert len(sent) == count
+        assert set(sent) == {("prepared", True)}
+
+
 def test_words_of_the_page_are_plain(editor: Editor, window: Client) -> None:
     bad = ("copy-paste", "gloss", "bounce", "tint", "shade", "substantial", "sets scale of", "viser")
     for step in ("Open", "Select", "Place", "Light", "Run", "Share"):

@@ -634,7 +634,8 @@ class Editor:
                 self.is_unsaved = False
                 self.say("saved again")
                 self.refresh()
-            self._want_light()  # of drafts that are prepared at rest
+            if self._light is not None and not self._light.is_started:
+                self._want_light()  # drafts that are prepared at rest; a process that has ended is not started here
             state = None if session is None else session.jobs.state()
             if state is not None:
                 self._show_job(state)

@@ -68,6 +68,11 @@ class LightProcess:
         self._wanted: Wanted | None = None
         self._lock = threading.Lock()
 
+    @property
+    def is_started(self) -> bool:
+        """Whether the process was started, even if it has ended."""
+        return self._child is not None
+
     def want(self, state: EditState, wanted: Wanted) -> None:
         """Request the light of a state in place of the last request, unless it was requested already."""
         with self._lock:
