@@ -74,6 +74,29 @@ def test_colour_alone_matches_the_reference():
         assert (ours - theirs).abs().max() < 3e-4 * theirs.abs().max()
 
 
+def test_what_reaches_into_the_image_from_outside_is_drawn():
+    # long and opaque Gaussians, whose centres are up to an image's width outside of the border
+    generator, view = torch.Generator().manual_seed(4), camera()
+    scene = random_scene(600, 0, seed=4)
+    angle, away = 2 * math.pi * torch.rand(600, generator=generator), 1 + 2 * torch.rand(600, generator=generator)
+    size = view.sizes[0].float()
+    pixels = 0.5 * size + 0.75 * away[:, None] * 0.5 * size * torch.stack([angle.cos(), angle.sin()], 1)
+    depth = 1 + torch.rand(600, 1, generator=generator)
+    rays = torch.cat([pixels, torch.ones(600, 1)], 1) @ torch.linalg.inv(view.intrinsics[0]).T * depth
+    pose = view.world_from_camera[0]
+    log_scales = torch.rand(600, 3, generator=generator) * 3 - 4
+    scene = replace(
+        scene, means=rays @ pose[:3, :3].T + pose[:3, 3], log_scales=log_scales, opacity_logits=torch.full((600,), 9.0)
+    )
+    weights, order = reference.weights(scene.map(lambda t: t.double()), view, RenderOptions())
+    reaching = torch.zeros(600, dtype=torch.bool)
+    reaching[order[(weights > 0).any(0).any(0)]] = True
+    outside = ((pixels < 0) | (pixels > size)).any(1)
+    assert int((reaching & outside).sum()) > 50
+    assert int((~reaching).sum()) > 50
+    assert not (reaching & ~rendering.render(scene, view).visible[0]).any()
+
+
 @pytest.mark.parametrize("low_pass", ["classic", "antialiased"])
 def test_inverse_depth_and_its_gradients_match_the_reference(low_pass):
     options = RenderOptions(low_pass=low_pass)
