@@ -208,7 +208,7 @@ class LitScenes:
 
 
 class _JoinedScene:
-    """A place with objects in one scene, of which a move changes only the objects and what is near their feet."""
+    """A place and objects in one scene. A move changes only the objects and the place's Gaussians near their feet."""
 
     def __init__(self, place: Gaussians, objects: Sequence[Gaussians]) -> None:
         self._place, self._scene = place, concatenate([place, *objects])
@@ -216,7 +216,7 @@ class _JoinedScene:
         self._flattened = self._darkened = _NO_ROWS
 
     def holds(self, place: Gaussians, objects: Sequence[Gaussians]) -> bool:
-        """Return whether this is the scene of a place and of as many Gaussians of objects."""
+        """Return whether the scene holds this place, and as many Gaussians of objects of the same degree."""
         degree = max(one.sh_degree for one in (place, *objects))
         count = place.count + sum(one.count for one in objects)
         return place is self._place and self._scene.count == count and self._scene.sh_degree == degree
