@@ -12,7 +12,7 @@ from nbclient import NotebookClient
 from PIL import Image
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("[0-9]*.py"))
-LONG = ("02_segment", "04_project", "05_several_objects")
+LONG = ("02_segment", "03_transfer", "04_project", "05_several_objects")
 
 
 @pytest.mark.parametrize(

@@ -149,6 +149,7 @@ def test_scenes_are_compared_with_those_that_the_data_set_s_card_names(tmp_path)
     assert others == "Real scenes that its card does not name: chair_in_attic."
 
 
+@pytest.mark.long
 def test_our_methods_run_on_pasted_pictures_and_masks_alone(tmp_path, monkeypatch):
     monkeypatch.setattr("splatgraft_paper.benchmark.scene.Segment", partial(Segment, solidify=4))
     scene = tmp_path / "data/data_3d/real/insertions" / TRUCK

@@ -325,8 +325,6 @@ class _ShadowEvidence:
     """Gaussians above the surface."""
     ambient: Float[Tensor, "s s"]
     """Share of all other light that reaches the texels."""
-    lamp_height: float = math.inf
-    """Height above the surface, world units, of the lamp whose shadows are compared; infinite for the sun."""
 
     @staticmethod
     def on_surfaces(captured: CapturedScene, region: BoundingSphere, *, most: int) -> "list[_ShadowEvidence]":
@@ -367,7 +365,7 @@ class _ShadowEvidence:
         h = self.surface.plane.height(self.standing.means)[:, None].clamp_max(_BELOW_LAMP * height)
         foot = self.standing.means - h * normal
         moved = self.standing.means + (foot - center - away) * h / (height - h) + away * h / height
-        return replace(self, standing=replace(self.standing, means=moved), lamp_height=height)
+        return replace(self, standing=replace(self.standing, means=moved))
 
     def above(self, directions: Float[Tensor, "k 3"]) -> Float[Tensor, "m 3"]:
         """Select the directions above the surface."""
@@ -444,29 +442,37 @@ def _find_sun_within(captured: CapturedScene, region: BoundingSphere, decisive: 
     direction, evidence, posterior = shown.best(shown.above(_DIRECTIONS), _prior_by_clock(captured.clock))
     if evidence < _PROMISING or posterior < decisive:
         return None
-    shown, direction, evidence = _lamp_or_sun(shown, direction, evidence)
+    sun = _measured(shown, direction, evidence)
+    lamp = None if sun is None else _lamp_near(sun, shown)
+    if lamp is None:
+        return sun
+    towards = shown.surface.center + lamp.distance * lamp.direction - region.center
+    return replace(lamp, direction=F.normalize(towards, dim=0), distance=float(towards.norm()))
+
+
+def _measured(shown: _ShadowEvidence, direction: Float[Tensor, "3"], evidence: float) -> Sun | None:
+    """Measure radius and ratio of a sun in a direction; None if its shadows show no strength."""
     radius, ratio = _radius_and_ratio(shown, direction)
     if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
         return None
-    normal, center = shown.surface.plane.normal, shown.surface.center
-    sun = Sun(direction, radius, normal, ratio, evidence)
-    if math.isinf(shown.lamp_height):
-        return sun
-    towards = center + shown.lamp_height / float(direction @ normal) * direction - region.center
-    return replace(sun, direction=F.normalize(towards, dim=0), distance=float(towards.norm()))
+    return Sun(direction, radius, shown.surface.plane.normal, ratio, evidence)
 
 
-def _lamp_or_sun(
-    sun: _ShadowEvidence, direction: Float[Tensor, "3"], evidence: float
-) -> tuple[_ShadowEvidence, Float[Tensor, "3"], float]:
-    """Return shadows, direction and log likelihood of the likeliest lamp near a sun; the sun's if none is likelier."""
-    near = sun.above(_around(direction, _LAMP_SPAN_DEG, _STEP_DEG))
-    lamps = [sun.of_lamp(direction, height * sun.surface.half) for height in _LAMP_HEIGHTS]
-    likelihoods = [float(one.log_likelihoods(near).max()) for one in (sun, *lamps)]
-    lamp = max(zip(likelihoods[1:], lamps, strict=True), key=itemgetter(0))
-    if lamp[0] < likelihoods[0] + _PROMISING:
-        return sun, direction, evidence
-    return lamp[1], *lamp[1].best(near, _prior_by_clock(None))[:2]
+def _lamp_near(sun: Sun, shown: _ShadowEvidence) -> Sun | None:
+    """Find a lamp near a sun, as seen from the surface's centre; None if no lamp is clearly likelier than the sun."""
+    near = shown.above(_around(sun.direction, _LAMP_SPAN_DEG, _STEP_DEG))
+    least = float(shown.log_likelihoods(near).max()) + _PROMISING
+    heights = [height * shown.surface.half for height in _LAMP_HEIGHTS]
+    lamps = [shown.of_lamp(sun.direction, height) for height in heights]
+    likelihood, height, lamp = max(
+        ((float(one.log_likelihoods(near).max()), height, one) for height, one in zip(heights, lamps, strict=True)),
+        key=itemgetter(0),
+    )
+    if likelihood < least:
+        return None
+    direction, evidence, _ = lamp.best(near, _prior_by_clock(None))
+    found = _measured(lamp, direction, evidence) if evidence > sun.evidence else None
+    return None if found is None else replace(found, distance=height / float(direction @ found.normal))
 
 
 def sun_near(
@@ -510,10 +516,8 @@ def sun_near(
     evidence, shown = max(((float(one.log_likelihoods(mean[None])), one) for one in surfaces), key=itemgetter(0))
     if evidence < _LIKELIER:
         return moved
-    radius, ratio = _radius_and_ratio(shown, mean)
-    if ratio is None or float(ratio @ LUMINANCE) < _MIN_RATIO:
-        return moved
-    return replace(moved, radius_deg=radius, normal=shown.surface.plane.normal, ratio=ratio, evidence=evidence)
+    measured = _measured(shown, mean, evidence)
+    return moved if measured is None else replace(measured, error_deg=moved.error_deg, name=name)
 
 
 def _prior_by_clock(clock: ClockSun | None) -> LogPrior:
@@ -564,9 +568,9 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
         if shown is None or not len(near):
             continue
         found, evidence, _ = shown.best(near, _prior_near(direction[None], _BY_HAND_DEG, wrong=0.0))
-        radius, ratio = _radius_and_ratio(shown, found)
-        if evidence > _PROMISING and ratio is not None and float(ratio @ LUMINANCE) > _MIN_RATIO:
-            return Sun(found, radius, shown.surface.plane.normal, ratio, math.inf, name=SET_BY_HAND)
+        measured = _measured(shown, found, math.inf) if evidence > _PROMISING else None
+        if measured is not None:
+            return replace(measured, name=SET_BY_HAND)
     error_deg = max(_ERROR_DEG, spread_deg)
     name = f"{SET_BY_HAND}, its strength estimated"
     return Sun(direction, _UNSEEN_RADIUS_DEG, captured.up, None, math.inf, error_deg, name)
