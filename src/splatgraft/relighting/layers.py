@@ -1,6 +1,5 @@
 """Result of a light transfer: a composite with shading, shadow, bounce and gloss as layers to weight and bake."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,8 +20,10 @@ from splatgraft.relighting.materials import gloss_bands, reflected_light
 from splatgraft.relighting.prepared_object import PreparedObject
 from splatgraft.relighting.scene_light import SceneLight
 from splatgraft.relighting.shading import (
+    KNOWN_IN_ESTIMATED,
     KNOWN_LIGHTS,
     KNOWN_SURFACES,
+    LEVEL_ERROR_STOPS,
     ShadeSettings,
     apply_gain,
     irradiance,
@@ -245,8 +246,7 @@ def _level_notes(scene: SceneLight, objects: Sequence[PreparedObject]) -> tuple[
     """Describe the uncertain level of an estimated light, which meshes show, because their albedo is absolute."""
     if scene.estimate is None or not any(isinstance(one.gaussians, KnownSurface) for one in objects):
         return ()
-    stops = scene.estimate.hidden.level_sd / math.log(2)
-    text = f"A mesh is as bright as it should be to a standard error of {stops:.1f} stops, that of the light's level."
+    text = f"A mesh is as bright as it should be to a standard error of {LEVEL_ERROR_STOPS:.1f} stops."
     return (Note(text, "said", "Compare it with things of similar colour beside it; exposure corrects it."),)
 
 
@@ -274,7 +274,7 @@ def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Ten
     if source is None:
         return _Shading(received, unknown_origin_ratio(received, opacities), None)
     if isinstance(one.gaussians, KnownSurface):
-        settings = KNOWN_SURFACES
+        settings = KNOWN_SURFACES if scene.estimate is None else KNOWN_IN_ESTIMATED
     else:
         settings = KNOWN_LIGHTS if scene.estimate is None and source.estimate is None else ShadeSettings()
     shade = shade_ratio(received, source.irradiance, opacities, settings=settings)

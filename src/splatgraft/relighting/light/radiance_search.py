@@ -29,7 +29,6 @@ _RELEVELED = 0.7  # share of the mean residual that albedos absorb before a stat
 _MIN_SHARE = 0.1  # minimum unknown share of a direction that may contain a lamp
 _STRENGTHS = (4.0, 12.0, 40.0, 120.0)  # radiance of a lamp over the previous radiance
 _APART = math.radians(18)  # minimum angle between two directions that are tried as lamps
-_LEVELS = 1.5  # largest change of the logarithm of all unknown radiances when their level's deviation is computed
 _SPREAD = math.radians(35)  # maximum angle over which the direction of a lamp is uncertain
 
 
@@ -54,8 +53,6 @@ class RadianceEstimate:
     """Radiance of each direction's clipped part beyond the camera's white."""
     residual: Float[Tensor, "m"]
     """Logarithm of observed over explained brightness of the receivers at the best maximum."""
-    level_sd: float
-    """Standard deviation of the logarithm of the mean irradiance at the object."""
 
     def radiance(self, evidence: LightEvidence) -> Float[Tensor, "k 3"]:
         """Compute the linear rgb radiance from all `DIRECTIONS` at the object.
@@ -98,36 +95,7 @@ def search_radiance(problem: RadianceProblem) -> RadianceEstimate:
         unseen=hidden[0].float(),
         clipped=hidden[1].float(),
         residual=problem.residual(at_best, albedo).float(),
-        level_sd=_level_sd(problem, maxima, weights),
     )
-
-
-def _level_sd(problem: RadianceProblem, maxima: list[Maximum], weights: Float[Tensor, "x"]) -> float:
-    """Combine the spread of the level between the maxima with that around the best one.
-
-    Around it, all unknown radiances get one factor, and the albedos the common factor that explains the colours again.
-    """
-
-    def level(state: Float[Tensor, "s"]) -> Tensor:
-        return irradiance_of(problem.radiance_at_object(state)).mean().clamp_min(1e-6).log()
-
-    levels = torch.stack([level(one.state) for one in maxima])
-    between = (weights * (levels - (weights * levels).sum()) ** 2).sum()
-    best, n = maxima[0], problem.transport.shape[1]
-    prior = problem.clipped_prior(best.sources)
-    costs, around = [], []
-    for factor in torch.linspace(-_LEVELS, _LEVELS, 13):
-        state = best.state.clone()
-        state[: 1 + n] += factor
-        _, radiances, albedo = problem.split(state)
-        residual = problem.residual(radiances, albedo)
-        state[1 + n :] += _RELEVELED * float((problem.weights * residual).sum() / problem.weights.sum().clamp_min(1e-9))
-        costs.append(cost(problem, prior, state))
-        around.append(level(state))
-    likely = torch.softmax(-torch.tensor(costs) / problem.settings.temperature, 0).to(levels)
-    values = torch.stack(around)
-    within = (likely * (values - (likely * values).sum()) ** 2).sum()
-    return float((between + within).sqrt())
 
 
 def _polished(problem: RadianceProblem, at: Maximum) -> Maximum:
