@@ -35,7 +35,7 @@ class ShadeSettings:
     It is small because an object turns violet or blue if the old light's tint is estimated wrongly. Chosen on 19 scenes
     that the light was not fitted to: 0 and 0.25 are equally good, 1 is worse."""
     typical: float = 1.0
-    """Mean of the ratio towards which its gray part is drawn."""
+    """Ratio from which `level_share` counts."""
 
 
 KNOWN_LIGHTS = ShadeSettings(level_share=1.0, tint_share=1.0)
@@ -108,9 +108,8 @@ def light_scale(
     log_ratio = (_floored(target, opacities, settings) / _floored(source, opacities, settings)).log()
     mean = _mean(log_ratio, opacities)[0]
     gray = mean.mean()
-    return (
-        (settings.level_share - 1) * (gray - math.log(settings.typical)) + (settings.tint_share - 1) * (mean - gray)
-    ).exp()
+    level, tint = gray - math.log(settings.typical), mean - gray
+    return ((settings.level_share - 1) * level + (settings.tint_share - 1) * tint).exp()
 
 
 def unknown_origin_ratio(target: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:

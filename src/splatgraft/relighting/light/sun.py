@@ -413,7 +413,7 @@ class _ShadowEvidence:
 
 
 def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float = _DECISIVE) -> Sun | None:
-    """Find the sun whose shadows a level surface shows, in the region or else in a wider one.
+    """Find the sun, or the lamp, whose shadows a level surface shows, in the region or else in a wider one.
 
     Without a clock, the wider region is at most as large as the cameras' distance. So it is left out if the object
     fills the views.
@@ -462,17 +462,16 @@ def _lamp_near(sun: Sun, shown: _ShadowEvidence) -> Sun | None:
     """Find a lamp near a sun, as seen from the surface's centre; None if no lamp is clearly likelier than the sun."""
     near = shown.above(_around(sun.direction, _LAMP_SPAN_DEG, _STEP_DEG))
     least = float(shown.log_likelihoods(near).max()) + _PROMISING
-    heights = [height * shown.surface.half for height in _LAMP_HEIGHTS]
-    lamps = [shown.of_lamp(sun.direction, height) for height in heights]
-    likelihood, height, lamp = max(
-        ((float(one.log_likelihoods(near).max()), height, one) for height, one in zip(heights, lamps, strict=True)),
-        key=itemgetter(0),
-    )
+    found = list[tuple[float, float, _ShadowEvidence]]()
+    for height in (share * shown.surface.half for share in _LAMP_HEIGHTS):
+        of_lamp = shown.of_lamp(sun.direction, height)
+        found.append((float(of_lamp.log_likelihoods(near).max()), height, of_lamp))
+    likelihood, height, lamp = max(found, key=itemgetter(0))
     if likelihood < least:
         return None
     direction, evidence, _ = lamp.best(near, _prior_by_clock(None))
-    found = _measured(lamp, direction, evidence) if evidence > sun.evidence else None
-    return None if found is None else replace(found, distance=height / float(direction @ found.normal))
+    measured = _measured(lamp, direction, evidence) if evidence > sun.evidence else None
+    return None if measured is None else replace(measured, distance=height / float(direction @ measured.normal))
 
 
 def sun_near(

@@ -321,7 +321,7 @@ def reachable(
 
 
 def umbra_lengths(sources: LightSamples, radius: float) -> Float[Tensor, "k"]:
-    """Compute the lengths of the umbras of a ball, world units; no shadow behind one is full. 0 for near lights.
+    """Compute how far the umbra of a ball reaches under each source, world units; 0 under near lights.
 
     Args:
         sources: k samples of sources.
