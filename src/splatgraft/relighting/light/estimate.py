@@ -38,7 +38,7 @@ from splatgraft.relighting.light.panorama import (
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
-from splatgraft.relighting.light.sun import Point, Sun, find_sun, set_sun, sun_near, with_sun
+from splatgraft.relighting.light.sun import UNSEEN_RADIUS_DEG, Point, Sun, find_sun, set_sun, sun_near, with_sun
 from splatgraft.rendering import render
 
 # the evidence; set by hand
@@ -57,7 +57,6 @@ _SEEN_NAMES = ("window", "lamp")  # low and high sources with a surface behind t
 _UNSEEN_NAMES = ("sun or window", "sun or lamp")  # low and high sources that no camera saw
 _AT_HORIZON, _ABOVE_HORIZON = (-0.1, 0.2), (0.1, 0.4)  # sines of heights; set by hand
 _OPEN = 1.2  # ratio of the distances seen there; rooms have up to 1.19, gardens and terraces 1.23 or more (log)
-_UNSEEN_RADIUS_DEG = 1.0  # angular radius of a source that no camera saw, beside the uncertainty of its direction
 
 # the view towards a source; set by hand
 _SOURCE_QUANTILE = 0.25  # quantile of the depths in that view that is the distance to the source
@@ -244,7 +243,7 @@ def _source(
     spread = float((weight * away**2).sum() / weight.sum().clamp_min(1e-9)) ** 0.5
     error = math.hypot(spread, 4.0)  # `DIRECTIONS` are resolved to about 4 degrees
     name = _UNSEEN_NAMES[float(direction @ evidence.up) > _LAMP]
-    return LightSource((x, y, z), (r, g, b), _UNSEEN_RADIUS_DEG, error, 1.0, name, blockers_within=within)
+    return LightSource((x, y, z), (r, g, b), UNSEEN_RADIUS_DEG, error, 1.0, name, blockers_within=within)
 
 
 def _mean_distance(distances: Float[Tensor, "p"], weight: Float[Tensor, "p"]) -> float:

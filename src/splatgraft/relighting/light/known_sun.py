@@ -20,7 +20,7 @@ from splatgraft.core.clock_sun import ClockSun, clock_directions
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import DIRECTIONS
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceProblem
-from splatgraft.relighting.light.sun import Sun
+from splatgraft.relighting.light.sun import ERROR_DEG, LOWEST_SINE, Sun
 
 # a clear sky, fitted by benchmarks/fit_sky.py
 _CLEAR = 11.2  # strength of the sun over the sine of its height
@@ -31,10 +31,8 @@ _TINT = (1.34, 0.97, 0.58)  # strength in red, green and blue over that in lumin
 _IS_CLEAR = 0.5  # prior probability of a clear sky
 _STRENGTHS = torch.logspace(-2, 1.4, 35, dtype=torch.float64)
 _LEAST = 0.1  # strength below which the sun is hidden
-_LOWEST = 0.02  # bound on the sine of the sun's height, by which is divided
 _SUN_RADIUS_DEG = 0.27
 _NEAR = 2.5  # standard errors between the clock's sun and an estimated source that may be the same
-_MIN_ERROR_DEG = 1.0
 _ROUNDS = 8  # iterations of reweighting
 
 BY_CLOCK = "sun by the photos' clock"
@@ -82,14 +80,14 @@ def _joined(
     apart_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(direction @ other)))))
     if apart_deg > _NEAR * math.hypot(error_deg, main.uncertainty_deg):
         return direction, error_deg
-    precisions = 1 / max(error_deg, _MIN_ERROR_DEG) ** 2, 1 / max(main.uncertainty_deg, _MIN_ERROR_DEG) ** 2
+    precisions = 1 / max(error_deg, ERROR_DEG) ** 2, 1 / max(main.uncertainty_deg, ERROR_DEG) ** 2
     mean = torch.nn.functional.normalize(precisions[0] * direction + precisions[1] * other, dim=0)
     return mean, sum(precisions) ** -0.5
 
 
 def _log_prior(sine: float) -> Float[Tensor, "r"]:
     """Return the log prior of `_STRENGTHS` for a sun whose height has this sine."""
-    clear = _CLEAR * max(sine, _LOWEST)
+    clear = _CLEAR * max(sine, LOWEST_SINE)
     is_clear = torch.exp(-0.5 * ((_STRENGTHS / clear).log() / _CLEAR_SD) ** 2)
     is_weaker = (clear >= _STRENGTHS).double()
     return (_IS_CLEAR * is_clear / is_clear.sum() + (1 - _IS_CLEAR) * is_weaker / is_weaker.sum() + 1e-12).log()
@@ -105,7 +103,7 @@ def _costs(
     gray, sines = rest.mean(1).double(), (DIRECTIONS @ evidence.up).clamp_min(0).double()
     at = int((DIRECTIONS @ direction).argmax())
     # radiance of the direction that gives the sun's irradiance on level ground
-    added = _STRENGTHS * (sines @ gray) / sines[at].clamp_min(_LOWEST)
+    added = _STRENGTHS * (sines @ gray) / sines[at].clamp_min(LOWEST_SINE)
     surfaces = evidence.surfaces
     transport, of_sun = surfaces.transport(evidence.far.distance).double(), surfaces.transport()[:, at].double()
     mean_color = (surfaces.weights[:, None] * surfaces.colors).sum(0).mean()

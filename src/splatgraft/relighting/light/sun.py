@@ -62,11 +62,11 @@ _DIRECTIONS = even_directions(1600)  # 5 degrees apart
 _AMBIENT_DIRECTIONS = even_directions(200)  # directions of all other light, on both sides of the surface
 _DARKEST = 0.02  # lower bound of that light's visibility at a texel, because occluders reflect some of it
 _STANDING_WITHIN = 1.4  # radii of the region within which Gaussians cast shadows
-_LOWEST = math.sin(math.radians(2.0))  # sine of the sun's minimum height over the surface
-_STRENGTHS = (1.0, 3.0, 9.0)  # irradiance of the sun over that of all other light on the surface, in the search
-_FINE_STRENGTHS = (0.5, 1.0, 1.8, 3.0, 5.0, 10.0)
+LOWEST_SINE = math.sin(math.radians(2.0))  # sine of the sun's minimum height over the surface
+_STRENGTHS = (0.5, 1.0, 1.8, 3.0, 5.0, 10.0)  # irradiance of the sun over that of all other light on the surface
+_FEW_STRENGTHS = _STRENGTHS[1::2]  # in the search
 _APART = math.cos(math.radians(8.0))  # cosine of the minimum angle between two maxima
-_SPANS = ((3.0, 1.0), (1.0, 0.33))  # half width and step of the grids around a maximum, degrees
+_FINE_STEPS_DEG = (1.0, 0.33)  # of the grids around a maximum, three on each side
 _LAMP_HEIGHTS, _LAMP_SPAN_DEG = (4.0, 2.0), 10.0  # half widths of the surface; search around the sun's direction
 _PROMISING = 10.0  # log likelihood over that of even light above which a direction of the search is refined
 _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
@@ -78,10 +78,10 @@ _CLOCK_IS_WRONG = 0.05  # probability that no candidate of the clock is the sun
 _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
 _MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
 _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12  # angular radii that are tried, and directions that sample each
-_UNSEEN_RADIUS_DEG = 1.0  # angular radius of a sun that no edge of a shadow shows
+UNSEEN_RADIUS_DEG = 1.0  # angular radius of a source that neither a camera nor an edge of a shadow shows
 _LIKELIER = 3.0  # difference of log likelihoods, 20 to 1, for a larger radius, and for the strength near a known sun
-_ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for others
-_BY_HAND_DEG, _BY_HAND_SPAN_DEG = 15.0, 30.0  # standard error of points set by hand; search around their direction
+ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for others
+_BY_HAND_DEG = 15.0  # standard error of a direction set by hand; the search reaches twice as far
 _BELOW_LAMP = 0.9  # of a lamp's height; what stands higher blocks as if it stood there
 _AROUND_SHADOW = 2.5  # region in which a sun set by hand is measured, in distances from a point to its shadow
 
@@ -109,7 +109,7 @@ class Sun:
     """Irradiance of the sun over that of all other light on the surface, for each channel; None if not measured."""
     evidence: float
     """Log likelihood over that of all other light alone; infinite if set by hand."""
-    error_deg: float = _ERROR_DEG
+    error_deg: float = ERROR_DEG
     """Standard error of the direction, degrees."""
     name: str = ""
     """Name in reports, as in `LightSource`; empty for a sun that was found."""
@@ -154,7 +154,7 @@ class Surface:
     def ambient(self, occluders: Occluders) -> Float[Tensor, "s s"]:
         """Compute the share of an even sky's irradiance that reaches the texels past occluders above the plane."""
         cosines = _AMBIENT_DIRECTIONS @ self.plane.normal
-        above = cosines > _LOWEST
+        above = cosines > LOWEST_SINE
         visible = self.shadows(occluders, _AMBIENT_DIRECTIONS[above])
         return torch.einsum("k,kst->st", cosines[above] / cosines[above].sum(), visible).clamp_min(_DARKEST)
 
@@ -369,7 +369,7 @@ class _ShadowEvidence:
 
     def above(self, directions: Float[Tensor, "k 3"]) -> Float[Tensor, "m 3"]:
         """Select the directions above the surface."""
-        return directions[directions @ self.surface.plane.normal > _LOWEST]
+        return directions[directions @ self.surface.plane.normal > LOWEST_SINE]
 
     def log_likelihoods(self, directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
         """Compute the log likelihood of suns in k directions over that of even light, without the finest edges."""
@@ -377,7 +377,7 @@ class _ShadowEvidence:
         every = coarse.every
         ambient = self.ambient[::every, ::every]
         visible = (self.surface.shadows(self.standing, part, every) for part in directions.split(64))  # bounds memory
-        return torch.cat([coarse.of_suns(one, ambient, _STRENGTHS) for one in visible])
+        return torch.cat([coarse.of_suns(one, ambient, _FEW_STRENGTHS) for one in visible])
 
     def best(self, directions: Float[Tensor, "k 3"], log_prior: LogPrior) -> tuple[Float[Tensor, "3"], float, float]:
         """Find the sun's most probable direction.
@@ -400,10 +400,10 @@ class _ShadowEvidence:
                 break
             mode = directions[score.argmax()]
             score = torch.where(directions @ mode > _APART, -math.inf, score)
-            for span, step in _SPANS:
-                near = self.above(_around(mode, span, step))
+            for step in _FINE_STEPS_DEG:
+                near = self.above(_around(mode, 3 * step, step))
                 shadows = _blurred(surface.shadows(self.standing, near))
-                found = fine.of_suns(shadows, blurred_ambient[0], _FINE_STRENGTHS) - without
+                found = fine.of_suns(shadows, blurred_ambient[0], _STRENGTHS) - without
                 posterior = found + log_prior(near)
                 i = int(posterior.argmax())
                 mode = near[i]
@@ -503,7 +503,7 @@ def sun_near(
     near = near[near @ direction > math.cos(math.radians(3 * error_deg))]
     for one in surfaces:
         near = one.above(near)
-    unmeasured = Sun(direction, _UNSEEN_RADIUS_DEG, captured.up, None, 0.0, error_deg, name)
+    unmeasured = Sun(direction, UNSEEN_RADIUS_DEG, captured.up, None, 0.0, error_deg, name)
     if not surfaces or not len(near):
         return unmeasured
     away_deg = torch.rad2deg((near @ direction).clamp(-1, 1).acos())
@@ -511,7 +511,7 @@ def sun_near(
     weights = log_density.softmax(0)
     mean = F.normalize(weights @ near, dim=0)
     variance = weights @ torch.rad2deg((near @ mean).clamp(-1, 1).acos()).square() / 2  # of two axes
-    moved = replace(unmeasured, direction=mean, error_deg=max(float(variance.sqrt()), _ERROR_DEG))
+    moved = replace(unmeasured, direction=mean, error_deg=max(float(variance.sqrt()), ERROR_DEG))
     evidence, shown = max(((float(one.log_likelihoods(mean[None])), one) for one in surfaces), key=itemgetter(0))
     if evidence < _LIKELIER:
         return moved
@@ -524,7 +524,7 @@ def _prior_by_clock(clock: ClockSun | None) -> LogPrior:
     towards = clock_directions(clock)
     if clock is None or not len(towards):
         return lambda directions: torch.zeros(len(directions))
-    return _prior_near(towards, max(clock.error_deg, _ERROR_DEG), wrong=_CLOCK_IS_WRONG)
+    return _prior_near(towards, max(clock.error_deg, ERROR_DEG), wrong=_CLOCK_IS_WRONG)
 
 
 def _prior_near(towards: Float[Tensor, "c 3"], error_deg: float, *, wrong: float) -> LogPrior:
@@ -563,16 +563,16 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
     pairs = torch.tensor(points).reshape(-1, 2, 3)
     for caster, shadow in pairs.unbind():
         shown = _ShadowEvidence.of(captured, BoundingSphere(shadow, _AROUND_SHADOW * float((caster - shadow).norm())))
-        near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, _BY_HAND_SPAN_DEG, _STEP_DEG))
+        near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, 2 * _BY_HAND_DEG, _STEP_DEG))
         if shown is None or not len(near):
             continue
         found, evidence, _ = shown.best(near, _prior_near(direction[None], _BY_HAND_DEG, wrong=0.0))
         measured = _measured(shown, found, math.inf) if evidence > _PROMISING else None
         if measured is not None:
             return replace(measured, name=SET_BY_HAND)
-    error_deg = max(_ERROR_DEG, spread_deg)
+    error_deg = max(ERROR_DEG, spread_deg)
     name = f"{SET_BY_HAND}, its strength estimated"
-    return Sun(direction, _UNSEEN_RADIUS_DEG, captured.up, None, math.inf, error_deg, name)
+    return Sun(direction, UNSEEN_RADIUS_DEG, captured.up, None, math.inf, error_deg, name)
 
 
 def direction_through(points: Sequence[Point], up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], float]:
@@ -590,7 +590,7 @@ def direction_through(points: Sequence[Point], up: Float[Tensor, "3"]) -> tuple[
         raise ValueError(f"sun_through: expected pairs of a point and its shadow, found {len(pairs)} points")
     casters, shadows = pairs[::2], pairs[1::2]
     towards = F.normalize(casters - shadows, dim=1)
-    if float((towards @ up).min()) < _LOWEST:
+    if float((towards @ up).min()) < LOWEST_SINE:
         i = int((towards @ up).argmin())
         height = float((casters[i] - shadows[i]) @ up)
         raise ValueError(
@@ -610,7 +610,7 @@ def _radius_and_ratio(shown: _ShadowEvidence, direction: Float[Tensor, "3"]) -> 
     by_radius = torch.full((len(_RADII_DEG),), -math.inf)
     blurred = torch.cat([softened, shown.ambient[None]])
     for _ in range(5):  # widths of the reconstruction's blur
-        by_radius = torch.maximum(by_radius, fine.of_suns(blurred[:-1], blurred[-1], _FINE_STRENGTHS))
+        by_radius = torch.maximum(by_radius, fine.of_suns(blurred[:-1], blurred[-1], _STRENGTHS))
         blurred = _blurred(blurred)
     radius = _RADII_DEG[int((by_radius > by_radius.max() - _LIKELIER).int().argmax())]
     return radius, lit_over_shaded(shown.picture, softened[0], shown.ambient)

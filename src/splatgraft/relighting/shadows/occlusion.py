@@ -119,12 +119,25 @@ def occluded_irradiance(
     ]
     out = np.zeros((3, len(points), 3), np.float32)
     place = np.array([*occlusion.center.tolist(), occlusion.radius, bias], np.float32)
-    _sum_samples(np.ascontiguousarray(occlusion.texels.numpy()), occlusion.size, place, tuple(arrays), out)
+    softness = arrays[3]
+    spirals = [_vogel(_SEARCH_TAPS), _vogel(_SOURCE_TAPS if len(softness) < _FEW_SAMPLES else _AMBIENT_TAPS)]
+    spreads = np.tan(np.minimum(softness, _WIDEST_CONE))
+    edges = np.sin(np.minimum(softness, np.float32(np.pi / 2)))  # a wider cone still ends at the horizon
+    maps = (np.ascontiguousarray(occlusion.texels.numpy()), occlusion.size)
+    _sum_samples(maps, place, tuple(arrays), (np.concatenate(spirals), spreads, edges), out)
     without, with_object, bounce = torch.from_numpy(out)
     return without, with_object, bounce
 
 
-@kernel(fastmath=True, inline="always")
+def _vogel(count: int) -> Float[np.ndarray, "t 2"]:
+    """Return points spread evenly over the unit disk."""
+    index = np.arange(count)
+    angle = index * _GOLDEN_ANGLE
+    radius = np.sqrt((index + 0.5) / count)[:, None]
+    return (radius * np.stack([np.cos(angle), np.sin(angle)], 1)).astype(np.float32)
+
+
+@kernel(fastmath=True)
 @no_type_check
 def _soft_cosine(cosine, edge):
     """Compute the mean of max(0, cos) over a cone whose radius has the sine `edge`, as `shading.soft_cosine` does."""
@@ -135,99 +148,101 @@ def _soft_cosine(cosine, edge):
     return (cosine + edge) * (cosine + edge) / (4 * edge)
 
 
+@kernel(fastmath=True)
+@no_type_check
+def _sum_samples_at(i, maps, place, arrays, cones, out):  # noqa: PLR0912, PLR0915  (search, filter, sums)
+    """Fill `out` for point i; a function of its own, because numba compiles a long loop body in `prange` slowly."""
+    texels, size = maps
+    frames, nearness, irradiance, _, points, normals, sample_visibility = arrays
+    disk, spreads, edges = cones
+    radius, bias = place[3], place[4]
+    texel = 2 * radius / size
+    search, taps = _SEARCH_TAPS, len(disk) - _SEARCH_TAPS
+    search_gap, tap_gap = _SEARCH_GAP, np.float32(2 / np.sqrt(taps))
+    x, y, z = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
+    for k in range(len(frames)):
+        f, near = frames[k], nearness[k]
+        # towards the light, in units of its distance from the centre
+        lx, ly, lz = -f[2, 0] - near * x, -f[2, 1] - near * y, -f[2, 2] - near * z
+        square = max(lx * lx + ly * ly + lz * lz, np.float32(1e-6))
+        cosine = (lx * normals[i, 0] + ly * normals[i, 1] + lz * normals[i, 2]) / np.sqrt(square)
+        weight = _soft_cosine(cosine, edges[k]) * sample_visibility[i, k] / square
+        if weight <= 0:
+            continue
+        for c in range(3):
+            out[0, i, c] += weight * irradiance[k, c]
+        depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
+        # in the plane through the centre, seen from the light
+        zoom = np.float32(1) / max(np.float32(1) + near * depth, np.float32(1e-3))
+        u = zoom * (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z)
+        v = zoom * (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z)
+        spread = spreads[k]
+        # the cosine changes over the cone, and directions below the surface give no light
+        tilt_u = spread * (f[0, 0] * normals[i, 0] + f[0, 1] * normals[i, 1] + f[0, 2] * normals[i, 2])
+        tilt_v = spread * (f[1, 0] * normals[i, 0] + f[1, 1] * normals[i, 1] + f[1, 2] * normals[i, 2])
+        facing = np.float32(0)
+        width = spread * zoom * max(np.float32(0), depth + radius) / (np.float32(1) - near * radius)
+        blocked, red, green, blue = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+        if depth > -radius and abs(u) < radius + width and abs(v) < radius + width:
+            found, distance = np.float32(0), np.float32(0)
+            level_size, level_start, over = size, 0, np.float32(1) / texel
+            for t in range(search + taps):
+                if t == search:
+                    if found < _MIN_ALPHA:
+                        break
+                    behind = max(np.float32(0), distance / found)
+                    width = spread * zoom * behind / (np.float32(1) + near * (depth - behind))
+                if t in (0, search):
+                    # the mip level whose pixels are about as wide as the distance between taps
+                    gap = width / texel * (search_gap if t < search else tap_gap)
+                    level_size, level_start, scale = size, 0, np.float32(1)
+                    while level_size > _COARSEST and gap > scale * _BLUR:
+                        level_start += level_size * level_size
+                        level_size //= 2
+                        scale *= 2
+                    over = np.float32(1) / (texel * scale)
+                tap_cosine = max(np.float32(0), cosine + disk[t, 0] * tilt_u + disk[t, 1] * tilt_v)
+                if t >= search:
+                    facing += tap_cosine
+                if tap_cosine <= 0:
+                    continue
+                pu = (u + disk[t, 0] * width + radius) * over - np.float32(0.5)
+                pv = (v + disk[t, 1] * width + radius) * over - np.float32(0.5)
+                column, row = int(np.floor(pu)), int(np.floor(pv))
+                fu, fv = pu - column, pv - row
+                for dv in range(2):
+                    for du in range(2):
+                        cu, cv = column + du, row + dv
+                        if cu < 0 or cv < 0 or cu >= level_size or cv >= level_size:
+                            continue
+                        p = texels[k, level_start + cv * level_size + cu]
+                        if p[0] < _MIN_ALPHA or p[1] > (depth - bias) * p[0]:
+                            continue
+                        share = (fu if du == 1 else 1 - fu) * (fv if dv == 1 else 1 - fv)
+                        if t < search:
+                            found += share * p[0]
+                            distance += share * (depth * p[0] - p[2])
+                        else:
+                            share *= tap_cosine
+                            blocked += share * p[0]
+                            red += share * p[3]
+                            green += share * p[4]
+                            blue += share * p[5]
+        if facing > 0:
+            blocked, red, green, blue = blocked / facing, red / facing, green / facing, blue / facing
+        blocked = min(blocked, np.float32(1))
+        # the unlit side's radiance times the projected solid angle of the sample's cone, pi * sin^2
+        cone = np.float32(np.pi) * edges[k] ** 2
+        for c in range(3):
+            out[1, i, c] += weight * (1 - blocked) * irradiance[k, c]
+        out[2, i, 0] += weight * red * cone
+        out[2, i, 1] += weight * green * cone
+        out[2, i, 2] += weight * blue * cone
+
+
 @serialized
 @kernel(parallel=True, fastmath=True)
 @no_type_check
-def _sum_samples(texels, size, place, arrays, out):  # noqa: PLR0912, PLR0915  (one kernel: search, filter, sums)
-    frames, nearness, irradiance, softness, points, normals, sample_visibility = arrays
-    radius, bias = place[3], place[4]
-    texel = 2 * radius / size
-    search, taps = _SEARCH_TAPS, _SOURCE_TAPS if len(frames) < _FEW_SAMPLES else _AMBIENT_TAPS
-    disk = np.empty((search + taps, 2), np.float32)  # Vogel spirals
-    search_gap, tap_gap = _SEARCH_GAP, np.float32(2 / np.sqrt(taps))
-    for t in range(search + taps):
-        count, j = (search, t) if t < search else (taps, t - search)
-        r, angle = np.sqrt((j + 0.5) / count), j * _GOLDEN_ANGLE
-        disk[t, 0], disk[t, 1] = r * np.cos(angle), r * np.sin(angle)
-    spreads = np.tan(np.minimum(softness, _WIDEST_CONE))
-    edges = np.sin(np.minimum(softness, np.float32(np.pi / 2)))  # a wider cone still ends at the horizon
-    for i in prange(len(points)):
-        x, y, z = points[i, 0] - place[0], points[i, 1] - place[1], points[i, 2] - place[2]
-        for k in range(len(frames)):
-            f, near = frames[k], nearness[k]
-            # towards the light, in units of its distance from the centre
-            lx, ly, lz = -f[2, 0] - near * x, -f[2, 1] - near * y, -f[2, 2] - near * z
-            square = max(lx * lx + ly * ly + lz * lz, np.float32(1e-6))
-            cosine = (lx * normals[i, 0] + ly * normals[i, 1] + lz * normals[i, 2]) / np.sqrt(square)
-            weight = _soft_cosine(cosine, edges[k]) * sample_visibility[i, k] / square
-            if weight <= 0:
-                continue
-            for c in range(3):
-                out[0, i, c] += weight * irradiance[k, c]
-            depth = f[2, 0] * x + f[2, 1] * y + f[2, 2] * z
-            # in the plane through the centre, seen from the light
-            zoom = np.float32(1) / max(np.float32(1) + near * depth, np.float32(1e-3))
-            u = zoom * (f[0, 0] * x + f[0, 1] * y + f[0, 2] * z)
-            v = zoom * (f[1, 0] * x + f[1, 1] * y + f[1, 2] * z)
-            spread = spreads[k]
-            # the cosine changes over the cone, and directions below the surface give no light
-            tilt_u = spread * (f[0, 0] * normals[i, 0] + f[0, 1] * normals[i, 1] + f[0, 2] * normals[i, 2])
-            tilt_v = spread * (f[1, 0] * normals[i, 0] + f[1, 1] * normals[i, 1] + f[1, 2] * normals[i, 2])
-            facing = np.float32(0)
-            width = spread * zoom * max(np.float32(0), depth + radius) / (np.float32(1) - near * radius)
-            blocked, red, green, blue = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-            if depth > -radius and abs(u) < radius + width and abs(v) < radius + width:
-                found, distance = np.float32(0), np.float32(0)
-                level_size, level_start, over = size, 0, np.float32(1) / texel
-                for t in range(search + taps):
-                    if t == search:
-                        if found < _MIN_ALPHA:
-                            break
-                        behind = max(np.float32(0), distance / found)
-                        width = spread * zoom * behind / (np.float32(1) + near * (depth - behind))
-                    if t in (0, search):
-                        # the mip level whose pixels are about as wide as the distance between taps
-                        gap = width / texel * (search_gap if t < search else tap_gap)
-                        level_size, level_start, scale = size, 0, np.float32(1)
-                        while level_size > _COARSEST and gap > scale * _BLUR:
-                            level_start += level_size * level_size
-                            level_size //= 2
-                            scale *= 2
-                        over = np.float32(1) / (texel * scale)
-                    tap_cosine = max(np.float32(0), cosine + disk[t, 0] * tilt_u + disk[t, 1] * tilt_v)
-                    if t >= search:
-                        facing += tap_cosine
-                    if tap_cosine <= 0:
-                        continue
-                    pu = (u + disk[t, 0] * width + radius) * over - np.float32(0.5)
-                    pv = (v + disk[t, 1] * width + radius) * over - np.float32(0.5)
-                    column, row = int(np.floor(pu)), int(np.floor(pv))
-                    fu, fv = pu - column, pv - row
-                    for dv in range(2):
-                        for du in range(2):
-                            cu, cv = column + du, row + dv
-                            if cu < 0 or cv < 0 or cu >= level_size or cv >= level_size:
-                                continue
-                            p = texels[k, level_start + cv * level_size + cu]
-                            if p[0] < _MIN_ALPHA or p[1] > (depth - bias) * p[0]:
-                                continue
-                            share = (fu if du == 1 else 1 - fu) * (fv if dv == 1 else 1 - fv)
-                            if t < search:
-                                found += share * p[0]
-                                distance += share * (depth * p[0] - p[2])
-                            else:
-                                share *= tap_cosine
-                                blocked += share * p[0]
-                                red += share * p[3]
-                                green += share * p[4]
-                                blue += share * p[5]
-            if facing > 0:
-                blocked, red, green, blue = blocked / facing, red / facing, green / facing, blue / facing
-            blocked = min(blocked, np.float32(1))
-            # the unlit side's radiance times the projected solid angle of the sample's cone, pi * sin^2
-            cone = np.float32(np.pi) * edges[k] ** 2
-            for c in range(3):
-                out[1, i, c] += weight * (1 - blocked) * irradiance[k, c]
-            out[2, i, 0] += weight * red * cone
-            out[2, i, 1] += weight * green * cone
-            out[2, i, 2] += weight * blue * cone
+def _sum_samples(maps, place, arrays, cones, out):
+    for i in prange(len(arrays[4])):
+        _sum_samples_at(np.int64(i), maps, place, arrays, cones, out)  # unsigned in a parallel loop: compiled twice
