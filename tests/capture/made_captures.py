@@ -72,5 +72,6 @@ def colmap_answer(names: list[str], poses: Tensor, size: tuple[int, int], **figu
         }
         for name, pose in zip(names, poses, strict=True)
     ]
+    photos = [{"name": name, "features": 900, "matches": 400, "moved": False} for name in names]
     fixed = {"models": 1, "method": "global", "explained": 0.8, "mean_reprojection_px": 0.4, "points": []}
-    return fixed | {"seconds": {}, "cpu_seconds": {}, "unposed": [], "images": images} | figures
+    return fixed | {"seconds": {}, "cpu_seconds": {}, "photos": photos, "agreements": [], "images": images} | figures

@@ -29,8 +29,16 @@ def turntable(folder: Path, count: int, step_deg: float, *, wall: bool = True) -
     return poses
 
 
-def turned_between_series(folder: Path, counts: tuple[int, int], step_deg: float, turned_deg: float) -> np.ndarray:
-    """Write two series of photos of a box in a room, and masks of the box, which is turned between the series.
+def turned_between_series(
+    folder: Path,
+    counts: tuple[int, int],
+    step_deg: float,
+    turned_deg: float,
+    *,
+    moved: tuple[float, float, float] = (0, 0, 0),
+    half: float = 0.7,
+) -> np.ndarray:
+    """Write two series of photos of a box in a room, and masks of the box, which is turned and moved in between.
 
     Returns:
         World from camera (count, 4, 4), OpenCV axes, in the frame of the box.
@@ -41,8 +49,9 @@ def turned_between_series(folder: Path, counts: tuple[int, int], step_deg: float
     textures, walls = ([texture(generator, 512) for _ in range(6)] for _ in range(2))
     poses = np.stack([_pose(np.deg2rad(i * step_deg)) for i in range(sum(counts))])
     for i, pose in enumerate(poses):
-        color, hit = _box(pose, textures)
+        color, hit = _box(pose, textures, half=half)
         in_room = _about_z(np.deg2rad(turned_deg if i >= counts[0] else 0)) @ pose
+        in_room[:3, 3] += moved if i >= counts[0] else (0, 0, 0)
         color[~hit] = _box(in_room, walls, half=6.0, inside=True)[0][~hit]
         Image.fromarray((color * 255).round().astype(np.uint8)).save(folder / "images" / f"{i:02d}.png")
         Image.fromarray(hit).save(folder / "masks" / f"{i:02d}.png")

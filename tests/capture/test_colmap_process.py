@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from made_up_photos import FOCAL, similarity_to, turned_between_series, turntable
 
-from splatgraft.capture import colmap_process
+from splatgraft.capture import colmap_process, pose_photos
 from splatgraft.capture.colmap_process.job import Job
+from splatgraft.formats.captures.masks import PhotoFiles
 
 PROGRAM = Path(colmap_process.__file__).parent
 pytestmark = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap is an optional extra")
@@ -81,6 +82,16 @@ def test_an_object_turned_between_two_series_is_posed_by_its_masks_in_a_room_tha
     assert len(best["images"]) == 18
     centers = np.array([image["world_from_camera"] for image in best["images"]])[:, :, 3]
     assert similarity_to(truth[:, :3, 3], centers)[1] < 0.045  # as for the turntable
+
+
+@pytest.mark.long
+def test_without_masks_photos_of_the_object_at_another_place_are_left_out_and_named(tmp_path: Path) -> None:
+    turned_between_series(tmp_path, (18, 3), 15, 90, moved=(-3.3, 1.2, 0), half=0.45)
+    photos = PhotoFiles(tuple(sorted((tmp_path / "images").iterdir())))
+    (tmp_path / "out").mkdir()
+    posed, report = pose_photos(photos, tmp_path / "out", scratch=tmp_path / "scratch")
+    assert [(one.name, one.astray) for one in report.missing] == [(f"{i:02d}", True) for i in (18, 19, 20)]
+    assert len(posed) == 18
 
 
 @pytest.mark.long
@@ -153,6 +164,30 @@ assert refined(job, folder / "photos.db", [part]).num_reg_images() == 10
 
 def test_photos_that_no_model_holds_are_posed_from_the_points_of_the_others(tmp_path: Path) -> None:
     printed_by(REFINE, tmp_path)
+
+
+AGREE = """
+from colmap_process.scores import agreements, best_of
+
+options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=10, num_points3D=300)
+with pycolmap.Database.open(folder / "photos.db") as opened:
+    truth = pycolmap.synthesize_dataset(options, opened)
+images = best_of(folder / "photos.db", [truth], 10)["images"]
+x, y, z = zip(*(row[:3] for row in images[4]["world_from_camera"]))
+turned = zip(z, y, (-a for a in x), (row[3] for row in images[4]["world_from_camera"]))
+images[4]["world_from_camera"] = [list(row) for row in turned]
+for a, b, matches, share in agreements(folder / "photos.db", images):
+    print(images[4]["name"] in (a, b), share)
+"""
+"""Turns the pose of one of ten photos of a synthetic model by 90 degrees, and prints how its pairs agree."""
+
+
+def test_matches_contradict_a_wrong_pose_and_no_other(tmp_path: Path) -> None:
+    pairs = [line.split() for line in printed_by(AGREE, tmp_path).splitlines() if line]
+    assert len(pairs) == 45
+    for is_turned, share in pairs:
+        # matches with an error within 4 px by chance: 8 of the 1000 px or so across an image
+        assert float(share) < 0.1 if is_turned == "True" else float(share) > 0.9
 
 
 PARTNERS = """

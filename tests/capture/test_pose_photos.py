@@ -15,6 +15,7 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from splatgraft.capture import PoseOptions, pose_photos, read_doubts, structure_from_motion, write_pose_report
+from splatgraft.capture.photo_inspection import find_in_coverage
 from splatgraft.capture.photos import camera_groups, working_copies
 from splatgraft.capture.pose_report import Doubt, Lens, PoseReport, Unposed, find_doubts
 from splatgraft.capture.structure_from_motion import upright
@@ -58,8 +59,8 @@ def circle(count, height=1.0):
 
 def model_of(posed, photos):
     """Return the answer of the COLMAP process with this number of posed photos."""
-    unposed = [{"name": f"{i:02d}.jpg", "features": 900, "matches": 12, "moved": False} for i in range(posed, photos)]
-    return colmap_answer([f"{i:02d}.jpg" for i in range(posed)], circle(posed), (40, 30), unposed=unposed)
+    rows = [{"name": f"{i:02d}.jpg", "features": 900, "matches": 12, "moved": False} for i in range(photos)]
+    return colmap_answer([f"{i:02d}.jpg" for i in range(posed)], circle(posed), (40, 30), photos=rows)
 
 
 @pytest.fixture
@@ -114,11 +115,48 @@ def test_where_less_than_half_is_posed_all_is_done_once_more_and_the_better_mode
 
 def test_a_photo_of_the_moved_object_is_left_out_and_named(tmp_path, answer):
     moved = {"name": "07.jpg", "features": 900, "matches": 400, "moved": True}
-    answer(model_of(7, 7) | {"unposed": [moved]})
+    answer(model_of(7, 7) | {"photos": [moved]})
     posed, report = pose(photo_paths(tmp_path / "photos", 8), tmp_path)
     assert len(posed) == 7
     assert report.missing == (Unposed("07", 900, 400, moved=True),)
     assert "1 (07: the object was moved or turned against its surroundings)" in str(report)
+
+
+def ring_with_two_past(kind):
+    """Return the answer for 14 photos of a ring, of which 05 and 06 look 40 degrees past its middle.
+
+    Each photo has 200 matches with the next two. If the poses are right, one pair of 05 has 60 false matches instead.
+    """
+    poses, names = circle(14), [f"{i:02d}.jpg" for i in range(14)]
+    angle = math.radians(40)
+    aside = torch.tensor([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    poses[5:7, :3, :3] @= aside
+    if kind == "all look outwards":
+        poses[:, :3, :3] @= torch.diag(torch.tensor([-1.0, 1, -1]))
+    rows = [[names[i], names[(i + step) % 14], 200, 1.0] for i in range(14) for step in (1, 2)]
+    for row in rows:
+        if len({"05.jpg", "06.jpg"} & {*row[:2]}) == 1 and kind != "turned away":
+            row[3] = 0.0
+    if kind == "turned away":
+        rows = [row for row in rows if "05.jpg" not in row or "06.jpg" in row] + [["04.jpg", "05.jpg", 60, 0.0]]
+    return colmap_answer(names, poses, (40, 30), agreements=rows)
+
+
+def test_photos_that_miss_the_point_of_the_others_and_contradict_their_matches_are_left_out_and_named(tmp_path, answer):
+    answer(ring_with_two_past("posed wrongly"))
+    posed, report = pose(photo_paths(tmp_path / "photos", 14), tmp_path)
+    assert [f"{i:02d}.jpg" for i in range(14) if i not in (5, 6)] == list(posed.cameras.names)
+    assert [(one.name, one.astray) for one in report.missing] == [("05", True), ("06", True)]
+    assert "2 (05, 06: its pose contradicts its matches, and it does not show what the others look at)" in str(report)
+
+
+@pytest.mark.parametrize("kind", ["turned away", "all look outwards"])
+def test_a_camera_that_was_turned_away_stays_and_so_do_all_without_a_common_point(tmp_path, answer, kind):
+    answer(ring_with_two_past(kind))
+    posed, report = pose(photo_paths(tmp_path / "photos", 14), tmp_path)
+    assert (len(posed), report.missing) == (14, ())
+    told = find_in_coverage(posed.cameras).text
+    assert ("2 do not show it: 05.jpg, 06.jpg" in told) == (kind == "turned away")
 
 
 def test_what_a_pass_posed_is_a_result_and_more_is_offered_with_its_time(tmp_path, answer):

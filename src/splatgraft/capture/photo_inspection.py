@@ -20,7 +20,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from splatgraft.capture.structure_from_motion import MIN_POSED_SHARE
-from splatgraft.capture.usable_views import MIN_VIEWS, log_sharpness
+from splatgraft.capture.usable_views import MIN_VIEWS, log_sharpness, past_subject
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.capture_orientation import WIDE_GAP_DEG, focus_point, widest_gap
 from splatgraft.core.exposure import Exposure, describe_inconsistency
@@ -252,6 +252,8 @@ def find_in_coverage(cameras: Cameras) -> Finding:
     except ValueError:  # no common focus point
         return Finding("coverage", "good", "the photos look outwards: a place, without an object to cut out")
     text = f"the photos cover {360 - gap:.0f} of 360 degrees around their subject"
+    past = [name for name, is_past in zip(cameras.names, past_subject(cameras).tolist(), strict=True) if is_past]
+    text += f"; {len(past)} do not show it: {_named(past)}" if past else ""
     if gap < WIDE_GAP_DEG:
         return Finding("coverage", "good", text)
     remedy = "photograph an object from there, too, or its back is guessed; a place needs no such photos"

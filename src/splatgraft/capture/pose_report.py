@@ -61,12 +61,16 @@ class Unposed:
     """Verified matches with the photo that matches best."""
     moved: bool = False
     """Whether its pose contradicts the matches on the object."""
+    astray: bool = False
+    """Whether its pose contradicts its matches and turns it past the focus point of the others."""
 
     @property
     def reason(self) -> str:
         """The usual reason for such figures."""
         if self.moved:
             return "the object was moved or turned against its surroundings"
+        if self.astray:
+            return "its pose contradicts its matches, and it does not show what the others look at"
         if self.features < _FEW_FEATURES:
             return "blurred, dark or without texture"
         if self.matches < MIN_INLIERS:

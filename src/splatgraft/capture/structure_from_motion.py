@@ -19,6 +19,7 @@ from splatgraft.capture.colmap_process.job import MAX_ERROR_PX, MIN_TRACK, PHASE
 from splatgraft.capture.panoramas import CUT_BELOW, are_panoramas, cut_views, panorama_from_views
 from splatgraft.capture.photos import camera_groups, working_copies, working_masks, write_undistorted
 from splatgraft.capture.pose_report import Lens, PoseReport, Unposed, find_doubts
+from splatgraft.capture.usable_views import past_subject
 from splatgraft.core.cameras import Cameras, pinhole
 from splatgraft.core.capture_orientation import estimate_up, quarter_turns
 from splatgraft.core.distortion import Distortion
@@ -38,6 +39,7 @@ _ADVICE = (
 _EXHAUSTIVE = 80  # largest number of photos for which all pairs are matched by default
 MIN_POSED_SHARE = 0.5
 """Smallest share of photos with a pose; photos without one are named and left out."""
+_AGREED = 0.6  # smallest share of a group's matches that right poses explain; 0.7 for the least photo of 7 captures
 _PANORAMA_SIZE = 4  # size of a panorama over that of a photo, because a view has a quarter of its width
 _THOROUGH_COST = 40  # time of a thorough attempt over that of a quick one (more, affine features; guided matching)
 
@@ -113,6 +115,7 @@ def pose_photos(
             progress(before + done, total, message)
 
         model = _run(_job(copies, masks, options, scratch / effort, panoramas=panoramas), advance, say)
+        model = _without_astray(model, copies[0].parent)
         found.append((model, _report(model, copies)))
         seconds, cpu = (sum(model[name].values()) for name in ("seconds", "cpu_seconds"))
         parts = ", ".join(f"{phase} {took:.0f}" for phase, took in model["seconds"].items())
@@ -147,6 +150,34 @@ def pose_photos(
     return posed, report
 
 
+def _without_astray(model: dict[str, Any], photos: Path) -> dict[str, Any]:
+    """Remove groups of photos that look past the subject and contradict the matches with the photos that show it."""
+    images = [image for image in model["images"] if image["camera"]]
+    if not images:
+        return model
+    intrinsics = [[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] for fx, fy, cx, cy, *_ in (i["camera"] for i in images)]
+    cameras = Cameras(
+        world_from_camera=torch.tensor([[*image["world_from_camera"], [0, 0, 0, 1]] for image in images]),
+        intrinsics=torch.tensor(intrinsics),
+        sizes=torch.tensor([stored_size(photos / image["name"]) for image in images]),
+        names=tuple(image["name"] for image in images),
+    )
+    past, index = past_subject(cameras), {name: i for i, name in enumerate(cameras.names)}
+    agreed = torch.zeros(len(images), len(images))  # matches of two photos, positive if most agree with their poses
+    for a, b, matches, share in model["agreements"]:
+        agreed[index[a], index[b]] = agreed[index[b], index[a]] = matches * (share - _AGREED)
+    group = ((agreed > 0) | torch.eye(len(images), dtype=torch.bool))[past][:, past].float()
+    for _ in images:
+        group = (group @ group).clamp_max(1)
+    against = group @ agreed[past][:, ~past].sum(1) < 0
+    astray = {cameras.names[i] for i in past.nonzero()[:, 0][against].tolist()}
+    return {
+        **model,
+        "images": [image for image in model["images"] if image["name"] not in astray],
+        "photos": [photo | {"astray": photo["name"] in astray} for photo in model["photos"]],
+    }
+
+
 def _report(model: Mapping[str, Any], copies: Sequence[Path]) -> PoseReport:
     by_camera: dict[int, list[dict[str, Any]]] = {}
     for image in filter(lambda image: image["camera"], model["images"]):  # panoramas have no lens
@@ -160,13 +191,14 @@ def _report(model: Mapping[str, Any], copies: Sequence[Path]) -> PoseReport:
         )
         for images in sorted(by_camera.values(), key=len, reverse=True)
     )
-    unposed = sorted(model["unposed"], key=lambda photo: photo["name"])
+    posed = {image["name"] for image in model["images"]}
+    unposed = [photo for photo in model["photos"] if photo["name"] not in posed]
     figures = {name: model[name] for name in ("explained", "mean_reprojection_px")}
     observations = [image["observations"] for image in model["images"]]
     return PoseReport(
         photos=len(copies),
         registered=len(model["images"]),
-        missing=tuple(Unposed(Path(p["name"]).stem, p["features"], p["matches"], p["moved"]) for p in unposed),
+        missing=tuple(Unposed(**photo | {"name": Path(photo["name"]).stem}) for photo in unposed),
         points=len(_good_points(model)),
         models=model["models"],
         method=model["method"],

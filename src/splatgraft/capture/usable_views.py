@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import ImageOps
 from torch import Tensor
 
@@ -32,6 +32,7 @@ MIN_VIEWS = 8
 """Smallest number of different photos or views: in a ring of 8, one every 45 degrees, three see each surface."""
 _MIN_PARALLAX_DEG = 3.0  # smallest parallax: 1 px of error at a focal length of 1000 px is 2% of the distance
 _POINTS, _CAMERAS = 256, 128  # most points and cameras whose parallax is measured, evenly spaced in their order
+_SUBJECT_SHARE = 0.8  # smallest share of cameras that show a subject; 1 in captures of one, at most 0.31 from drones
 _MIN_SIDE_PX = 16  # shorter side; smaller photos hold no window of SSIM (11 px) and no features
 _MEASURED_PX = 800
 """Longest side at which sharpness is measured, or the median photo's if that is smaller: larger photos are compared at
@@ -295,6 +296,15 @@ def median_parallax_deg(cameras: Cameras, points: Float[Tensor, "m 3"]) -> float
     except ValueError:
         return None
     return float(_widest_deg(centers, focus, torch.ones(len(some), 1, dtype=torch.bool))[0])
+
+
+def past_subject(cameras: Cameras) -> Bool[Tensor, "v"]:
+    """Find the cameras that do not show the focus point, if most cameras show it; otherwise find none."""
+    try:
+        seen = _seen(cameras, focus_point(cameras).double()[None])[:, 0]
+    except ValueError:
+        return torch.zeros(len(cameras), dtype=torch.bool)
+    return ~seen & bool(seen.double().mean() >= _SUBJECT_SHARE)
 
 
 def _seen(cameras: Cameras, points: Float[Tensor, "m 3"]) -> Tensor:

@@ -35,7 +35,7 @@ from .database import (
 )
 from .job import Clock, Job, say
 from .refinement import refined
-from .scores import Answer, best_of, connected_photos, moved_photos, unposed
+from .scores import Answer, agreements, best_of, connected_photos, moved_photos, photo_figures
 
 _ALL, _MASKED = "photos", "masked"  # names of the databases with all features, and with those inside the masks
 _ENOUGH_PHOTOS = 0.9  # smallest share of photos with a pose at which the search may end
@@ -52,7 +52,8 @@ def main(words: dict[str, Any]) -> None:
         find_features(job)
     best = _search(job, clock)
     times = {"seconds": clock.seconds, "cpu_seconds": clock.cpu_seconds}
-    _write(job.output, best | {"unposed": unposed(_database(job, _ALL), best)} | times)
+    pairs = agreements(_database(job, best["database"]), best["images"])
+    _write(job.output, best | {"photos": photo_figures(_database(job, _ALL), best), "agreements": pairs} | times)
 
 
 def _end_with_parent() -> None:

@@ -84,31 +84,43 @@ def moved_photos(database: Path, answer: Answer, masks: Path) -> list[str]:
     Returns:
         Names of the photos of all groups that contradict the largest one.
     """
-    posed = {i["name"]: i for i in answer["images"] if (masks / f"{i['name']}.png").is_file()}
-    with pycolmap.Database.open(database) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images() if image.name in posed}
-        rays = {i: _rays(posed[name]["camera"], opened.read_keypoints(i)[:, :2]) for i, name in names.items()}
-    group = {i: i for i in names}
+    posed = [image for image in answer["images"] if (masks / f"{image['name']}.png").is_file()]
+    group = {image["name"]: image["name"] for image in posed}
 
-    def root(i: int) -> int:
-        while group[i] != i:
-            i = group[i]
-        return i
+    def root(name: str) -> str:
+        while group[name] != name:
+            name = group[name]
+        return name
 
-    apart: list[tuple[int, int]] = []
-    for a, b, rows in read_matches(database):
-        if a not in names or b not in names or len(rows) < MIN_INLIERS:
-            continue
-        errors = _sampson_px(posed[names[a]], posed[names[b]], rays[a][rows[:, 0]], rays[b][rows[:, 1]])
-        if (errors <= _EPIPOLAR_PX).mean() >= _AGREED:
+    apart: list[tuple[str, str]] = []
+    for a, b, _, share in agreements(database, posed):
+        if share >= _AGREED:
             group[root(a)] = root(b)
         else:
             apart.append((a, b))
-    sizes = Counter(root(i) for i in names)
-    largest = max(sizes, key=lambda i: (sizes[i], -i), default=0)
+    sizes = Counter(map(root, group))
+    largest = max(sizes, key=lambda name: sizes[name], default="")
     pairs = [{root(a), root(b)} for a, b in apart]
     against = {one for pair in pairs if largest in pair for one in pair} - {largest}
-    return sorted(names[i] for i in names if root(i) in against)
+    return sorted(name for name in group if root(name) in against)
+
+
+def agreements(database: Path, images: list[dict[str, Any]]) -> list[tuple[str, str, int, float]]:
+    """Compute the share of matches that two poses explain, for each pair of `images` with enough verified matches.
+
+    Returns:
+        Names of both photos, the number of their matches, and the share of these within 4 px of their epipolar lines.
+    """
+    posed = {image["name"]: image for image in images if image["camera"]}  # panoramas have no lens
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images() if image.name in posed}
+        rays = {i: _rays(posed[name]["camera"], opened.read_keypoints(i)[:, :2]) for i, name in names.items()}
+    found: list[tuple[str, str, int, float]] = []
+    for a, b, rows in read_matches(database):
+        if a in names and b in names and len(rows) >= MIN_INLIERS:
+            errors = _sampson_px(posed[names[a]], posed[names[b]], rays[a][rows[:, 0]], rays[b][rows[:, 1]])
+            found.append((names[a], names[b], len(rows), float((errors <= _EPIPOLAR_PX).mean())))
+    return found
 
 
 def _rays(camera: list[float], keypoints: np.ndarray) -> np.ndarray:
@@ -196,9 +208,8 @@ def lens_numbers(camera: Any) -> list[float]:
     return [f, f, cx, cy, k, 0.0, 0.0, 0.0]
 
 
-def unposed(database: Path, answer: Answer) -> list[dict[str, Any]]:
-    """Return name, features, most matches with one other photo and whether it was moved, for photos without a pose."""
-    posed = {image["name"] for image in answer["images"]}
+def photo_figures(database: Path, answer: Answer) -> list[dict[str, Any]]:
+    """Return name, features, most matches with one other photo and whether it was moved, for all photos."""
     most: dict[int, int] = {}
     for *pair, rows in read_matches(database):
         for i in pair:
@@ -212,5 +223,4 @@ def unposed(database: Path, answer: Answer) -> list[dict[str, Any]]:
                 "moved": image.name in answer["moved"],
             }
             for image in sorted(opened.read_all_images(), key=lambda image: image.name)
-            if image.name not in posed
         ]
