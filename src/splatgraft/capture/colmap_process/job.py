@@ -52,8 +52,8 @@ class Job:
 
     @property
     def output(self) -> Path:
-        """File of the best model."""
-        return self.folder / "best.json"
+        """File of the best model; files of an earlier version had another name and other values."""
+        return self.folder / "model.json"
 
 
 def say(sentence: str) -> None:
