@@ -13,10 +13,11 @@ from waiting import HANG_LIMIT, wait_until
 
 from splatgraft.cli import main
 from splatgraft.editor import job_process, sharing
-from splatgraft.editor.jobs import Jobs, JobState, PlannedStep, seconds_left, seconds_left_in_job, write_state
+from splatgraft.editor.jobs import Jobs, JobState, seconds_left, seconds_left_in_job, write_state
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
 from splatgraft.exports.export import EXPORT_SUFFIXES
+from splatgraft.project.step_table import PlannedStep
 
 WORK = """
 import sys, os, signal, time

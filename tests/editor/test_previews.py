@@ -20,18 +20,18 @@ from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor import relit_preview, transfer_values
+from splatgraft.editor import relit_preview
 from splatgraft.editor.light_process import LightProcess, Lit
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import CoarseGaussians, Draft, RelitPreview, coarse_draft, coarsen
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState
-from splatgraft.editor.transfer_values import TransferValues
 from splatgraft.formats import read_gaussians, write_gaussians
 from splatgraft.project.toml_edit import with_keys
-from splatgraft.relighting import LayerWeights, Light, RelightOptions, Relit, SourceScene
+from splatgraft.relighting import LayerWeights, Light, RelightOptions, Relit, SourceScene, transfer
 from splatgraft.relighting.layers import pasted
+from splatgraft.relighting.transfer import TransferValues
 
 
 @pytest.fixture(scope="module")
@@ -290,8 +290,8 @@ def test_what_drafts_share_is_computed_before_the_first_move(project: Path, monk
 
 @pytest.mark.long
 def test_a_draft_takes_the_light_at_the_old_place_from_the_full_transfer(monkeypatch: pytest.MonkeyPatch) -> None:
-    estimated = MagicMock(side_effect=transfer_values.find_source_light)
-    monkeypatch.setattr(transfer_values, "find_source_light", estimated)
+    estimated = MagicMock(side_effect=transfer.find_source_light)
+    monkeypatch.setattr(transfer, "find_source_light", estimated)
     floor = sunlit_scene(torch.tensor([0.6, 0.0, 0.8]), 3.0)
     around = even_directions(200)
     ball = surfels(0.2 * around + torch.tensor([0.0, 0.0, 0.2]), around, width=0.03)

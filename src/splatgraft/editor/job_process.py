@@ -13,7 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from splatgraft.editor.jobs import JobState, PlannedStep, acquire_job_lock, write_state
+from splatgraft.editor.jobs import JobState, acquire_job_lock, write_state
+from splatgraft.project.step_table import PlannedStep
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import os_error_line
 from splatgraft.runtime.progress import Progress

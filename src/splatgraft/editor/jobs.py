@@ -15,6 +15,7 @@ from typing import Literal
 
 import filelock
 
+from splatgraft.project.step_table import PlannedStep
 from splatgraft.runtime.files import atomic_write, writable
 
 _STATE_FILE, _LOG_FILE, _LOCK_FILE = "job.json", "job.log", "job.lock"
@@ -23,18 +24,6 @@ _WAIT = 0.02
 """Seconds between reads of the state file while a job starts."""
 _MIN_SPENT = 2.0
 """Seconds after which a counter's rate is known."""
-
-
-@dataclass(frozen=True)
-class PlannedStep:
-    """A step of a job's plan."""
-
-    name: str
-    """Name of the step."""
-    seconds: float
-    """Expected duration."""
-    is_measured: bool
-    """Whether `seconds` is the duration of an earlier run of this step, rather than a default."""
 
 
 @dataclass(frozen=True)

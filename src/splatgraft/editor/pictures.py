@@ -23,7 +23,6 @@ from splatgraft.core.images import read_upright, resize
 from splatgraft.core.prompts import ViewPrompt
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.light_process import Lit
-from splatgraft.editor.memo import Memo
 from splatgraft.editor.photo_view import PhotoView, prompt_of
 from splatgraft.editor.relit_preview import Draft
 from splatgraft.editor.scene_cache import SceneCache
@@ -34,6 +33,7 @@ from splatgraft.project.placement import ObjectPlacement
 from splatgraft.relighting import LayerWeights, Relit
 from splatgraft.relighting.shading import apply_gain
 from splatgraft.rendering import RenderOptions, render, view_operator
+from splatgraft.runtime.memo import Memo
 from splatgraft.segmentation import CUT_SIDE_PX, grabcut_mask, seed_selection
 
 Kind = Literal["lit", "pasted", "result", "place", "shadow", "photo"]

@@ -15,7 +15,6 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.drag import Drag, DragMode, outline
 from splatgraft.editor.form import Form
-from splatgraft.editor.memo import Memo
 from splatgraft.editor.panel import CORNERS, BoxDrag, Panel, Pointer, box_over, view_camera
 from splatgraft.editor.pictures import same_places
 from splatgraft.editor.placement import (
@@ -37,6 +36,7 @@ from splatgraft.editor.state import check_numbers, check_state
 from splatgraft.editor.stream import View
 from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
 from splatgraft.project.placement import ObjectPlacement
+from splatgraft.runtime.memo import Memo
 from splatgraft.segmentation import Box
 
 if TYPE_CHECKING:

@@ -17,11 +17,11 @@ from torch import Tensor
 from splatgraft.compositing.composite import Composite
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.editor.memo import Memo
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState
-from splatgraft.editor.transfer_values import TransferValues
 from splatgraft.relighting import Relit, SourceScene
+from splatgraft.relighting.transfer import TransferValues
+from splatgraft.runtime.memo import Memo
 
 T = TypeVar("T")
 TARGET_BUDGET, OBJECT_BUDGET = 30_000, 8_000

@@ -17,7 +17,6 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.clock_sun import ClockSun
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.editor.memo import Memo
 from splatgraft.editor.placement import PlaceableObject
 from splatgraft.editor.project import ProjectFiles
 from splatgraft.editor.state import EditState
@@ -26,6 +25,7 @@ from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.project.gaussian_flags import read_flags
 from splatgraft.project.placement import ObjectPlacement
 from splatgraft.relighting import SourceScene
+from splatgraft.runtime.memo import Memo
 
 
 class SceneCache:

@@ -30,6 +30,18 @@ _OBJECT, _SURROUNDINGS = _AT.object / OBJECT_FILE, _AT.object / SURROUNDINGS_FIL
 
 
 @dataclass(frozen=True)
+class PlannedStep:
+    """A step that a run will perform."""
+
+    name: str
+    """Name of the step."""
+    seconds: float
+    """Expected duration."""
+    is_measured: bool
+    """Whether `seconds` is the duration of an earlier run of this step, rather than a default."""
+
+
+@dataclass(frozen=True)
 class StepRow:
     """One step of a project."""
 

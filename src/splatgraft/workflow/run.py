@@ -8,10 +8,10 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
-from splatgraft.editor.jobs import PlannedStep
 from splatgraft.project.layout import REPORT_FILE, SCENE_FILE
 from splatgraft.project.record import why_stale
 from splatgraft.project.step import clear_leftovers, job_of, locked, perform
+from splatgraft.project.step_table import PlannedStep
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import is_writable
 from splatgraft.steps.capture import Capture, doubt_about

@@ -9,14 +9,13 @@ import torch
 from splatgraft.capture import VIDEO_FRAMES, predict_pose_seconds
 from splatgraft.core.cameras import Cameras, pinhole
 from splatgraft.core.images import stored_size
-from splatgraft.editor.jobs import PlannedStep
 from splatgraft.folders.capture_files import has_poses
 from splatgraft.formats import is_scene, read_capture
 from splatgraft.formats.captures.masks import find_photos
 from splatgraft.formats.captures.photo_archive import count_archived_photos, is_archive
 from splatgraft.project.record import Record, read_record
 from splatgraft.project.step import Step, plain_options
-from splatgraft.project.step_table import STEPS
+from splatgraft.project.step_table import STEPS, PlannedStep
 from splatgraft.reconstruction import predict_cpu_seconds
 from splatgraft.steps.capture import Capture
 from splatgraft.steps.reconstruct import Reconstruct

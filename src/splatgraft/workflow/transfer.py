@@ -11,7 +11,6 @@ from splatgraft.composition import PlaceOptions, place_object
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
-from splatgraft.editor.transfer_values import TransferValues
 from splatgraft.exports.export import ExportOptions, export_scene
 from splatgraft.exports.export_source import ExportSource
 from splatgraft.exports.notebook import frame_of, picture_of
@@ -25,6 +24,7 @@ from splatgraft.project.step import plain_options
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.relighting import Light, RelightOptions, SourceScene, light_from_json, light_to_json
+from splatgraft.relighting.transfer import TransferValues
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.process import open_page
