@@ -19,6 +19,7 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.rotations import rotation_about, rotation_between
 from splatgraft.core.similarity import Similarity
+from splatgraft.editor.picking import Ray
 from splatgraft.editor.placement import PlaceableObject, rescale
 from splatgraft.rendering import render
 
@@ -55,14 +56,15 @@ class Drag:
         found = render(self._place, self._camera, outputs=frozenset({"depth"}))
         self._depth = torch.where(found.alpha[0] > 0.5, found.depth[0], 0.0)
         self._foot = placed.points(item.base.point)
+        self._height, self._radius = placed.scale * item.base.height, placed.scale * item.base.radius
         self._last = self._foot
         self._near: tuple[Tensor, Gaussians] | None = None
         support = self._support(self._foot)
         above = math.inf if support is None else float((self._foot - support.point) @ self._up)
-        self._stands = abs(above) < _NEAR * placed.scale * item.base.height
+        self._stands = abs(above) < _NEAR * self._height
         self._flat = 0.0 if support is None else min(_FLAT, _ALIKE * support.flat_fraction)
-        straight = support is not None and float(placed.rotation @ item.base.up @ support.normal) > _STRAIGHT
-        self._is_straight = straight
+        tilt = 0.0 if support is None else float(placed.rotation @ item.base.up @ support.normal)
+        self._is_straight = tilt > _STRAIGHT
         self._best = placed
 
     def at(self, mode: DragMode, start: Point2, pointer: Point2, *, anywhere: bool = False) -> Similarity:
@@ -99,8 +101,7 @@ class Drag:
         support = self._support(foot)
         if support is None or support.flat_fraction < self._flat:
             return None
-        height = self.placed.scale * self.item.base.height
-        if not anywhere and abs(float((support.point - self._foot) @ self._up)) > _STEP * height:
+        if not anywhere and abs(self._above_foot(support.point)) > _STEP * self._height:
             return None
         rotation = self._best.rotation
         if self._is_straight and float(rotation @ self.item.base.up @ support.normal) < _EVEN:
@@ -109,43 +110,34 @@ class Drag:
         return Similarity(scale=self.placed.scale, rotation=rotation, translation=translation.float())
 
     def _support(self, foot: Float[Tensor, "3"]) -> Support | None:
-        radius, height = self.placed.scale * self.item.base.radius, self.placed.scale * self.item.base.height
         # a search among nearby Gaussians is fast
-        if self._near is None or float((self._near[0] - foot).abs().max()) > 2 * radius:
-            near = (self._place.means - foot).abs().amax(1) < _NEAR_RADII * radius + height
+        if self._near is None or float((self._near[0] - foot).abs().max()) > 2 * self._radius:
+            near = (self._place.means - foot).abs().amax(1) < _NEAR_RADII * self._radius + self._height
             self._near = foot, self._place.select(near)
         try:
-            return support_below(self._near[1], foot + 0.5 * height * self._up, up=self._up, radius=radius)
+            above = foot + 0.5 * self._height * self._up
+            return support_below(self._near[1], above, up=self._up, radius=self._radius)
         except ValueError:
             return None  # no surface below
 
     def _pointed_at(self, dx: float, dy: float, *, anywhere: bool) -> Float[Tensor, "3"]:
         """Return the foot under the pointer: on the surface there, or at its last height if that surface is another."""
-        u, v = self._pixel(dx, dy)
-        ray, origin = self._ray(u, v), self._camera.centers[0]
-        depth = float(self._depth[int(v), int(u)])
-        if depth > 0 and self._stands:
-            hit = origin + depth * ray
-            if (
-                anywhere
-                or abs(float((hit - self._foot) @ self._up)) < _STEP * self.placed.scale * self.item.base.height
-            ):
-                return hit
+        width, height = self._camera.width, self._camera.height
+        pixels, depth = self._camera.project(self._foot)
+        u, v = pixels.tolist() if float(depth) > 0 else (0.5 * width, 0.5 * height)
+        u, v = min(max(u + dx * width, 0.0), width - 1.0), min(max(v + dy * height, 0.0), height - 1.0)
+        found = Ray.through((u / width, v / height), self._camera)
+        ray, origin, depth = found.direction, found.origin, float(self._depth[int(v), int(u)])
+        hit = origin + depth * ray
+        if depth > 0 and self._stands and (anywhere or abs(self._above_foot(hit)) < _STEP * self._height):
+            return hit
         fall = float(ray @ self._up)
         distance = float((self._last - origin) @ self._up) / fall if abs(fall) > _MIN_SIN else -1.0
         return origin + distance * ray if distance > 0 else self._last
 
-    def _pixel(self, dx: float, dy: float) -> Point2:
-        pixels, depth = self._camera.project(self._foot)
-        u, v = pixels.tolist() if float(depth) > 0 else (0.5 * self._camera.width, 0.5 * self._camera.height)
-        u, v = u + dx * self._camera.width, v + dy * self._camera.height
-        return min(max(u, 0.0), self._camera.width - 1.0), min(max(v, 0.0), self._camera.height - 1.0)
-
-    def _ray(self, u: float, v: float) -> Float[Tensor, "3"]:
-        """Return the ray through a pixel, scaled to depth 1."""
-        k = self._camera.intrinsics[0]
-        local = torch.tensor([(u - float(k[0, 2])) / float(k[0, 0]), (v - float(k[1, 2])) / float(k[1, 1]), 1.0])
-        return self._camera.world_from_camera[0, :3, :3] @ local
+    def _above_foot(self, point: Float[Tensor, "3"]) -> float:
+        """Return the height of a point over the initial foot."""
+        return float((point - self._foot) @ self._up)
 
     # up and down
 
@@ -172,10 +164,8 @@ class Corner:
 
     def at(self, pointer: Point2) -> Float[Tensor, "3"]:
         """Return the point under the pointer."""
-        depth = self.camera.project(self.point)[1]
-        k, pose = self.camera.intrinsics[0], self.camera.world_from_camera[0]
-        pixel = torch.tensor([pointer[0] * self.camera.width, pointer[1] * self.camera.height, 1.0])
-        return pose[:3, :3] @ (torch.linalg.inv(k) @ pixel * depth) + pose[:3, 3]
+        ray = Ray.through(pointer, self.camera)
+        return ray.origin + self.camera.project(self.point)[1] * ray.direction
 
 
 def outline(points: Float[Tensor, "n 3"], camera: Cameras) -> list[Point2]:

@@ -9,6 +9,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +32,15 @@ from splatgraft.editor.project import Project
 from splatgraft.editor.result_panels import RunPanel, SharePanel
 from splatgraft.editor.select_panel import SelectPanel
 from splatgraft.editor.server import Server, Window
-from splatgraft.editor.session import Session, Stamps, disk_full, stamps_of
+from splatgraft.editor.session import Session, disk_full
 from splatgraft.editor.sharing import served_file, written_exports
 from splatgraft.editor.state import EditState
+from splatgraft.editor.state_files import Stamps, stamps_of
 from splatgraft.editor.stream import Stream, View
 from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.runtime.files import os_error_line
+from splatgraft.runtime.memo import Memo
 
-STEPS = ("Open", "Select", "Place", "Light", "Run", "Share")
 KINDS: dict[str, Kind] = {
     "With its new light": "lit",
     "Pasted, unlit": "pasted",
@@ -54,6 +56,8 @@ _PAUSE_SECONDS = 0.2  # time without a move in a drag before the light of its pl
 _IDLE_SECONDS = 0.5  # time at rest before drafts of the light are prepared
 _DRAWN_SECONDS = 0.3  # longest wait of a drag's next move for the picture of the last one
 _CURRENT, _DONE, _STALE, _NEXT = "●", "✓", "↻", "›"
+_VIEW_KINDS = ("size", "ack", "turn", "pan", "zoom", "split")
+"""Kinds of messages about a window's own view."""
 _WORDS = {"do": "id", "live": "id", "key": "key", "step": "to"}
 """Kinds of messages about the panel, with the field that must be a string."""
 _MAX_ACTIONS = 200  # waiting messages
@@ -75,19 +79,19 @@ class Editor:
         self.step = "Open"
         self.live: EditState | None = None
         """State shown during a drag, in place of the saved one."""
-        self.kind, self.before = "With its new light", "Pasted, unlit"
+        self.kind: Kind = "lit"
+        """Kind of the picture of the target."""
+        self.before: Kind = "pasted"
+        """Kind of the comparison picture."""
         self.status, self.is_bad, self.is_unsaved = "", False, False
         self.offer: dict[str, Any] | None = None
         """File for the editing window to download."""
-        self.pictures: Pictures | None = None
         self._light: LightProcess | None = None
         self._form = Form()
         self._seen: Stamps = ()
         self._marks: dict[str, str] = {}
-        self._caption, self._space = "", (None, None)
-        self._ups: dict[str, tuple[Any, np.ndarray]] = {}
+        self._memo = Memo()
         self._last_job = ""
-        self._panel = ""
         self._is_open = True
         self._actions: queue.Queue[tuple[Window, dict[str, Any]] | None] = queue.Queue(_MAX_ACTIONS)
         self._moves: dict[str, Any] | None = None
@@ -127,31 +131,34 @@ class Editor:
         self.session, self.problem, self._seen = None, None, stamps_of(self.project.file)
         if self._light is not None:
             self._light.close()
-        self._light = self.pictures = None
+        self._light = None
         for view in self.stream.views:
             view.orbits.clear()
         try:
             if self.project.files() is not None:
-                self.session = session = Session(self.project)
-                self.pictures = Pictures(session.scenes)
-                self._light = LightProcess(self.project, self._lit, self._light_failed)
+                self.session = Session(self.project)
+                self._light = LightProcess(self.project, self._lit, self._failed)
         except (ValueError, OSError) as error:
             self.problem = " ".join(str(error).split())
         session = self.session
-        files = None if session is None else session.files
-        if session is None or files is None or not files.source_scene.is_file() or not files.target_scene.is_file():
+        if session is None or not session.files.have_both_scenes:
             self.show_step("Open")
             return
-        if files.relit.is_file() and session.why_stale("relight") is None and self.pictures is not None:
+        if session.files.relit.is_file() and session.why_stale("relight") is None:
             with contextlib.suppress(ValueError, OSError):  # the light is then computed
-                self.pictures.lit.adopt(session.placed_state())
-        self.show_step("Place" if files.object.is_file() else "Select")
+                session.pictures.lit.adopt(session.placed_state())
+        self.show_step("Place" if session.files.object.is_file() else "Select")
 
     def require_session(self) -> Session:
         """Return the open project; raise ValueError if no project is open."""
         if self.session is None:
             raise ValueError("Start a project first.")
         return self.session
+
+    @property
+    def pictures(self) -> Pictures | None:
+        """Pictures of the open project."""
+        return None if self.session is None else self.session.pictures
 
     def shown_state(self) -> EditState:
         """Return the state of the current drag, or the saved state."""
@@ -195,11 +202,9 @@ class Editor:
 
     def _add_view(self, form: Form) -> None:
         """Add the controls of the picture, common to all steps of the target."""
-        form.choice("kind", "Picture", self.kind, list(KINDS), lambda value: setattr(self, "kind", value))
-        form.choice(
-            "before", "Compare with", self.before, list(KINDS), lambda value: setattr(self, "before", value),
-            hint="Left of the divider, and while Tab is held",
-        )  # fmt: skip
+        form.choice("kind", "Picture", self.kind, KINDS, partial(setattr, self, "kind"))
+        hint = "Left of the divider, and while Tab is held"
+        form.choice("before", "Compare with", self.before, KINDS, partial(setattr, self, "before"), hint=hint)
         self.add_photos(form)
 
     def add_photos(self, form: Form) -> None:
@@ -208,8 +213,9 @@ class Editor:
         if cameras is not None and len(cameras) > 1 and view is not None:
             photo = 1 if view.photo is None else view.photo + 1
             hint = "Look from the place of a photo; also by the arrow keys"
-            ends = (1, len(cameras), 1)
-            form.slider("photo", "Photo", photo, ends, lambda value: self.to_photo(int(value) - 1), hint=hint)
+            ends, show = (1, len(cameras), 1), lambda value: self.to_photo(int(value) - 1)
+            form.slider("photo", "Photo", photo, ends, show, hint=hint)
+            form.while_dragged("photo", show)
 
     def _send_panel(self) -> None:
         session = self.session
@@ -218,7 +224,7 @@ class Editor:
             "t": "panel",
             "project": "no project yet" if session is None else session.files.file.parent.name,
             "saved": saved,
-            "steps": [[name, _CURRENT if name == self.step else self._marks.get(name, "")] for name in STEPS],
+            "steps": [[name, _CURRENT if name == self.step else self._marks.get(name, "")] for name in self.panels],
             "controls": self._form.controls,
             "status": self.status if self.status or session is None else session.unsaved or "",
             "bad": self.is_bad or bool(session and session.unsaved and not self.status),
@@ -239,10 +245,10 @@ class Editor:
 
     def draw(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], dict[str, Any]]:
         """Draw a window's view and its overlay."""
-        panel, pictures, problem = self.panels[self.step], self.pictures, ""
+        panel, problem = self.panels[self.step], ""
         over: dict[str, Any] = {}
         try:
-            if pictures is None:
+            if self.session is None:
                 raise ValueError("There is nothing to see yet.")
             pixels, caption = panel.picture(view, camera)
             over = panel.overlay(view, camera)
@@ -253,26 +259,22 @@ class Editor:
 
     def draw_target(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
         """Draw the target, with the comparison picture left of the divider, and its caption."""
-        pictures, state, kind = self.pictures, self.shown_state(), KINDS[self.kind]
-        assert pictures is not None
-        column = round(view.split * camera.width)
-        parts = []
-        for name, left, right in ((self.before, 0, column), (self.kind, column, camera.width)):
-            if right > left:
-                part = camera if right - left == camera.width else camera.cropped([(left, 0, right, camera.height)])
-                if KINDS[name] == "photo":
-                    parts.append(pictures.draw("photo", state, camera, view.photo)[:, left:right])
-                else:
-                    parts.append(pictures.draw(KINDS[name], state, part))
+        session, state = self.require_session(), self.shown_state()
+        pictures, column, parts = session.pictures, round(view.split * camera.width), []
+        sides: list[tuple[Kind, int, int]] = [(self.before, 0, column), (self.kind, column, camera.width)]
+        for kind, left, right in sides:
+            if left == right:
+                continue
+            part = camera if right - left == camera.width else camera.cropped([(left, 0, right, camera.height)])
+            if kind == "photo":
+                parts.append(pictures.draw(kind, state, camera, view.photo)[:, left:right])
+            else:
+                parts.append(pictures.draw(kind, state, part))
         caption = "full quality"
-        if kind in ("lit", "shadow") and state.objects:
-            stage = pictures.lit.stage(state)
+        if self.kind in ("lit", "shadow") and state.objects:
             words = {"": "old light: computing", "draft": "draft of the light", "refined": "light: nearly done"}
-            caption = (
-                words.get(stage, "full quality")
-                if self.require_session().files.transfers_light
-                else "light transfer off"
-            )
+            caption = words.get(pictures.lit.stage(state), caption)
+            caption = caption if session.files.transfers_light else "light transfer off"
         return parts[0] if len(parts) == 1 else np.concatenate(parts, 1), caption
 
     def orbit(self, view: View) -> Orbit | None:
@@ -309,44 +311,40 @@ class Editor:
         if self.session is None:
             return None
         files = self.session.files
-        scene, path = (
-            (files.source_scene, files.source_cameras)
-            if self.side == "source"
-            else (files.target_scene, files.target_cameras)
-        )
+        pairs = {
+            "source": (files.source_scene, files.source_cameras),
+            "target": (files.target_scene, files.target_cameras),
+        }
+        scene, path = pairs[self.side]
         return self.session.scenes.cameras(path) if path.is_file() and scene.is_file() else None
 
     def up(self) -> np.ndarray:
         """Return the up direction of the shown scene."""
-        session, cameras = self.require_session(), self.cameras()
-        if self._ups.get(self.side, (None, None))[0] is not cameras:
-            # kept here, because views must not wait for a session's computations
-            self._ups[self.side] = (cameras, session.up(self.side).double().numpy())
-        return self._ups[self.side][1]
+        session, side = self.require_session(), self.side
+        # kept here, because views must not wait for a session's computations
+        return self._memo.get(f"up {side}", (self.cameras(),), lambda: session.up(side).double().numpy())
 
     def _free_space(self) -> FreeSpace | None:
         session, cameras = self.session, self.cameras()
         if session is None or cameras is None:
             return None
         scene, objects = session.scenes.gaussians(session.files.target_scene), session.objects()
-        known, space = self._space
-        if known is None or known[0] is not scene or known[1] is not objects:
+
+        def make() -> FreeSpace:
             foot = objects[0].target_from_object.points(session.placeable_object(0).base.point) if objects else None
-            space = FreeSpace.of(scene, cameras, session.up("target"), foot)
-            self._space = ((scene, objects), space)
-        return space
+            return FreeSpace.of(scene, cameras, session.up("target"), foot)
+
+        return self._memo.get("free space", (scene, objects), make)
 
     def _want_light(self) -> None:
-        session, pictures = self.session, self.pictures
-        if session is None or pictures is None or self._light is None or self.step == "Select" or not self.stream.views:
+        session = self.session
+        if session is None or self._light is None or self.step == "Select" or not self.stream.views:
             return
         if not session.files.transfers_light or not session.files.target_scene.is_file():
             return
         state = self.shown_state()
-        if not state.objects:
-            return
-        stage = pictures.lit.stage(state)
-        if stage == "final":
+        stage = session.pictures.lit.stage(state)
+        if not state.objects or stage == "final":
             return
         if self.live is not None:
             self._light.want(state, "draft")
@@ -362,15 +360,11 @@ class Editor:
             if self.live is None:
                 self.refresh()
 
-    def _light_failed(self, text: str) -> None:
-        self.say(text, bad=True)
-        self._send_panel()
-
     def _drawing_failed(self, error: Exception) -> None:
         traceback.print_exception(error)
         self._failed(error)
 
-    def _failed(self, error: Exception) -> None:
+    def _failed(self, error: Exception | str) -> None:
         self.say(str(error), bad=True)
         self._send_panel()
 
@@ -393,8 +387,8 @@ class Editor:
         view, kind = self.stream.of(window), message["t"]
         if view is None:
             return
-        if kind in ("size", "ack", "turn", "pan", "zoom", "split"):
-            getattr(self, f"_take_{kind}")(view, message)
+        if kind in _VIEW_KINDS:
+            self._take_view(view, message)
             return
         if kind == "pointer":
             Pointer.of(message)
@@ -412,29 +406,27 @@ class Editor:
             except queue.Full as error:
                 raise ValueError("expected fewer messages") from error
 
-    def _take_size(self, view: View, message: dict[str, Any]) -> None:
-        width, height = int(message["w"]), int(message["h"])
-        if not (0 < width < 1 << 15 and 0 < height < 1 << 15):
-            raise ValueError("expected a size of a canvas")
-        view.size = (width, height)
-        self.stream.touch(view)
-
-    def _take_ack(self, view: View, message: dict[str, Any]) -> None:
-        self.stream.acknowledge(view, int(message["n"]))
-
-    def _take_turn(self, view: View, message: dict[str, Any]) -> None:
-        self._move_view(view, lambda orbit: orbit.turned(_share(message["x"]), _share(message["y"]), up=self.up()))
-
-    def _take_pan(self, view: View, message: dict[str, Any]) -> None:
-        self._move_view(view, lambda orbit: orbit.moved(_share(message["x"]), _share(message["y"])))
-
-    def _take_zoom(self, view: View, message: dict[str, Any]) -> None:
-        factor = 2 ** _share(message["by"])
-        self._move_view(view, lambda orbit: orbit.zoomed(factor, scale=self.scene_scale()))
-
-    def _take_split(self, view: View, message: dict[str, Any]) -> None:
-        view.split = min(1.0, max(0.0, _share(message["x"])))
-        self.stream.touch(view, moving=True)
+    def _take_view(self, view: View, message: dict[str, Any]) -> None:
+        """Handle a message about a window's own view."""
+        kind = message["t"]
+        if kind == "size":
+            width, height = int(message["w"]), int(message["h"])
+            if not (0 < width < 1 << 15 and 0 < height < 1 << 15):
+                raise ValueError("expected a size of a canvas")
+            view.size = (width, height)
+            self.stream.touch(view)
+        elif kind == "ack":
+            self.stream.acknowledge(view, int(message["n"]))
+        elif kind == "split":
+            view.split = min(1.0, max(0.0, _share(message["x"])))
+            self.stream.touch(view, moving=True)
+        elif kind == "zoom":
+            factor = 2 ** _share(message["by"])
+            self._move_view(view, lambda orbit: orbit.zoomed(factor, scale=self.scene_scale()))
+        else:
+            x, y = _share(message["x"]), _share(message["y"])
+            is_turn = kind == "turn"
+            self._move_view(view, lambda orbit: orbit.turned(x, y, up=self.up()) if is_turn else orbit.moved(x, y))
 
     def _move_view(self, view: View, move: Callable[[Orbit], Orbit]) -> None:
         found = view.orbits.get(self.side)
@@ -484,35 +476,22 @@ class Editor:
         if self.is_bad and not is_move and message["t"] != "opened":
             self.say("")  # an error stays until the next action
         with self.reported():
-            getattr(self, f"_do_{message['t']}")(view, message)
+            self._do(view, message)
         if not is_move:
             self.refresh()
 
-    def _do_opened(self, view: View, message: dict[str, Any]) -> None:
-        """Do nothing; the `refresh` that follows requests the light."""
-
-    def _do_do(self, view: View, message: dict[str, Any]) -> None:
-        if not self._form.offers(message["id"], message.get("value")):
-            return  # the panel has changed meanwhile
-        self._form.handle(message["id"], message.get("value"))
-
-    def _do_live(self, view: View, message: dict[str, Any]) -> None:
-        if not self._form.offers(message["id"], message.get("value")):
-            return
-        if message["id"] == "photo":
-            self.to_photo(int(message["value"]) - 1)
-        else:
-            self.panels[self.step].live(message["id"], message["value"])
-
-    def _do_pointer(self, view: View, message: dict[str, Any]) -> None:
-        self.panels[self.step].pointer(view, Pointer.of(message))
-
-    def _do_step(self, view: View, message: dict[str, Any]) -> None:
-        if message["to"] in STEPS:
+    def _do(self, view: View, message: dict[str, Any]) -> None:
+        kind = message["t"]
+        if kind in ("do", "live"):
+            self._form.take(message["id"], message.get("value"), live=kind == "live")
+        elif kind == "pointer":
+            self.panels[self.step].pointer(view, Pointer.of(message))
+        elif kind == "step" and message["to"] in self.panels:
             self.show_step(message["to"])
+        elif kind == "key":
+            self._press(view, message["key"])
 
-    def _do_key(self, view: View, message: dict[str, Any]) -> None:
-        key, session = message["key"], self.session
+    def _press(self, view: View, key: str) -> None:
         common: dict[str, Callable[[], object]] = {
             "ctrl+z": lambda: self._undo(self.require_session().undo(), "undone", "nothing to undo"),
             "ctrl+shift+z": lambda: self._undo(self.require_session().redo(), "redone", "nothing to redo"),
@@ -521,11 +500,7 @@ class Editor:
         }
         if key in common:
             common[key]()
-        elif (
-            not self.panels[self.step].key(view, str(key))
-            and session is not None
-            and key in ("arrowleft", "arrowright")
-        ):
+        elif not self.panels[self.step].key(view, key) and key in ("arrowleft", "arrowright"):
             self.to_photo((view.photo or 0) + (1 if key == "arrowright" else -1))
 
     def _undo(self, is_done: bool, done: str, nothing: str) -> None:
@@ -536,8 +511,8 @@ class Editor:
         """Switch to another step."""
         self.panels[self.step].leave()
         self.live, self.step = None, step
-        if step in ("Place", "Light") and self.kind == "Result":
-            self.kind = "With its new light"
+        if step in ("Place", "Light") and self.kind == "result":
+            self.kind = "lit"
         self.say("")
         for view in self.stream.views:
             view.photo = None if self.side == "target" else 0
@@ -626,8 +601,7 @@ class Editor:
             if self.problem is not None and stamps_of(self.project.file) != self._seen:
                 self.open_project()
             elif session is not None and session.reload():
-                if self.pictures is not None:
-                    self.pictures.lit.forget()
+                session.pictures.lit.forget()
                 self.say("the project's files were changed outside the editor and were loaded again")
                 self.refresh()
             elif session is not None and (session.unsaved or self.is_unsaved) and session.save_again():
@@ -703,11 +677,10 @@ def _marks(session: Session) -> dict[str, str]:
     def state(exists: bool, *steps: str) -> str | None:
         return None if not exists else _DONE if all(reasons.get(step) is None for step in steps) else _STALE
 
-    have_both = files.source_scene.is_file() and files.target_scene.is_file()
     exports = written_exports(files)
     result = max((p.stat().st_mtime_ns for p in (files.result, files.relit) if p.is_file()), default=0)
     states = {
-        "Open": state(have_both, "source/reconstruct", "target/reconstruct"),
+        "Open": state(files.have_both_scenes, "source/reconstruct", "target/reconstruct"),
         "Select": state(files.object.is_file(), "segment"),
         "Place": _DONE if session.objects() else None,
         "Light": _DONE if session.state.light is not None or files.relit.is_file() else None,

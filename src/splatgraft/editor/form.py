@@ -18,7 +18,9 @@ class Form:
         """Start without controls."""
         self.controls: list[dict[str, Any]] = []
         """Controls for the page to draw; `editor.js` defines their kinds."""
-        self._handlers: dict[str, tuple[Callable[[Any], Any], Handler]] = {}
+        self._handlers: dict[str, tuple[Handler, Handler]] = {}
+        """Check of a value and handler of the checked value, by control."""
+        self._live: dict[str, Handler] = {}
         self._is_more = False
 
     def more(self) -> None:
@@ -36,24 +38,25 @@ class Form:
         """Add a button; `main` marks the one that continues the step."""
         self._add("button", name, label=label, main=main, disabled=disabled)
         if not disabled:
-            self._handlers[name] = (lambda value: None, lambda _: work())
+            self.hidden(name, work)
 
     def buttons(self, name: str, choices: Mapping[str, Callable[[], object]]) -> None:
         """Add a row of buttons."""
         self._add("buttons", name, options=list(choices))
-        self._handlers[name] = (_one_of(list(choices)), lambda value: choices[value]())
+        self._handle(name, _one_of(list(choices)), lambda value: choices[value]())
 
     def check(self, name: str, label: str, value: bool, work: Handler, *, hint: str = "") -> None:
         """Add a checkbox."""
         self._add("check", name, label=label, value=value, hint=hint)
-        self._handlers[name] = (_one_of([False, True]), work)
+        self._handle(name, _one_of([False, True]), work)
 
     def choice(
-        self, name: str, label: str, value: str, options: Sequence[str], work: Handler, *, hint: str = ""
+        self, name: str, label: str, value: Any, options: Mapping[str, Any], work: Handler, *, hint: str = ""
     ) -> None:
-        """Add a menu."""
-        self._add("choice", name, label=label, value=value, options=list(options), hint=hint)
-        self._handlers[name] = (_one_of(options), work)
+        """Add a menu of values by their labels; it shows the first label if `value` has none."""
+        shown = next((key for key, option in options.items() if option == value), next(iter(options)))
+        self._add("choice", name, label=label, value=shown, options=list(options), hint=hint)
+        self._handle(name, _one_of(list(options)), lambda key: work(options[key]))
 
     def slider(
         self, name: str, label: str, value: float, ends: tuple[float, float, float], work: Handler, *, hint: str = ""
@@ -67,7 +70,7 @@ class Form:
                 raise ValueError("expected a number on the slider")
             return value
 
-        self._handlers[name] = (checked, work)
+        self._handle(name, checked, work)
 
     def numbers(
         self, name: str, label: str, values: Sequence[float], work: Handler, *, step: float = 0.001, hint: str = ""
@@ -80,21 +83,27 @@ class Form:
                 raise ValueError("expected as many numbers as there are fields")
             return tuple(_number(value) for value in given)
 
-        self._handlers[name] = (checked, work)
+        self._handle(name, checked, work)
+
+    def number(
+        self, name: str, label: str, value: float, work: Handler, *, step: float = 0.001, hint: str = ""
+    ) -> None:
+        """Add one number field."""
+        self.numbers(name, label, [value], lambda values: work(values[0]), step=step, hint=hint)
 
     def text(self, name: str, label: str, value: str, work: Handler, *, hint: str = "", browse: bool = False) -> None:
         """Add a text field; `browse` adds a button that opens the folders of this machine."""
         self._add("text", name, label=label, value=value, hint=hint, browse=browse)
-        self._handlers[name] = (_text, work)
+        self._handle(name, _text, work)
 
     def hidden(self, name: str, work: Callable[[], object]) -> None:
         """Add a handler for part of another control, such as its button `browse`."""
-        self._handlers[name] = (lambda value: None, lambda _: work())
+        self._handle(name, lambda value: None, lambda _: work())
 
     def rows(self, name: str, rows: Sequence[str], work: Handler) -> None:
         """Add a list of clickable lines."""
         self._add("rows", name, options=list(rows))
-        self._handlers[name] = (_one_of(rows), work)
+        self._handle(name, _one_of(rows), work)
 
     def upload(self, name: str, label: str, suffixes: Sequence[str], *, many: bool = False) -> None:
         """Add an upload button and a drop area; the files are sent by separate requests."""
@@ -110,7 +119,8 @@ class Form:
                 raise ValueError("expected a place in the drawing")
             return index, float(x), float(y), is_end
 
-        self._handlers[name] = (checked, work)
+        self._handle(name, checked, work)
+        self.while_dragged(name, work)
 
     def progress(self, name: str, share: float) -> None:
         """Add a progress bar; `share` is in [0, 1]."""
@@ -121,27 +131,30 @@ class Form:
         if links:
             self._add("links", name, options=[list(link) for link in links])
 
-    def handle(self, name: str, value: Any) -> None:
-        """Call the handler of a control with a value that a browser sent.
+    def while_dragged(self, name: str, work: Handler) -> None:
+        """Call `work` with the values of a slider or drawing while it is dragged."""
+        self._live[name] = work
 
-        Raises:
-            KeyError: If there is no such control.
-            ValueError: If it does not offer that value, or its handler refuses it.
+    def take(self, name: str, value: Any, *, live: bool = False) -> None:
+        """Call the handler of a control with a value that a browser sent, also `live` ones of a drag.
+
+        Nothing is done if there is no such control or it does not offer that value, because the panel may have changed
+        meanwhile. Raise ValueError if the handler refuses the value.
         """
-        check, work = self._handlers[name]
-        work(check(value))
-
-    def offers(self, name: str, value: Any) -> bool:
-        """Return whether a control exists and offers a value."""
         try:
-            self._handlers[name][0](value)
+            check, work = self._handlers[name]
+            work = self._live[name] if live else work
+            value = check(value)
         except (ValueError, TypeError, KeyError):
-            return False
-        return True
+            return
+        work(value)
 
     def _add(self, kind: str, name: str, **properties: Any) -> None:
         given = {key: value for key, value in properties.items() if value is not False and value != ""}
         self.controls.append({"kind": kind, "id": name, **given, **({"more": True} if self._is_more else {})})
+
+    def _handle(self, name: str, check: Handler, work: Handler) -> None:
+        self._handlers[name] = (check, work)
 
 
 def _one_of(options: Sequence[Any]) -> Callable[[Any], Any]:

@@ -1,7 +1,9 @@
 """The step `Light`: drag lights on a picture of the sky or in the view, set a sun by two clicks, set strengths."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,10 +13,9 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.editor.drag import Corner, on_canvas
 from splatgraft.editor.form import Form
-from splatgraft.editor.panel import Panel, Pointer, view_camera
-from splatgraft.editor.picking import first_surface_hit
-from splatgraft.editor.session import Session
-from splatgraft.editor.sky_dome import SkyDome
+from splatgraft.editor.panel import Panel, Pointer
+from splatgraft.editor.picking import Ray, first_surface_hit
+from splatgraft.editor.sky_dome import SkyDome, color_of
 from splatgraft.editor.state import check_state
 from splatgraft.editor.stream import View
 from splatgraft.relighting import Light, LightSource
@@ -36,7 +37,6 @@ _LAYERS = (
     ("gloss", "Reflections", (0.0, 2.0), "On the object; 1 is as computed"),
 )
 """Fields of `LayerWeights`, with label, ends of the slider and hint."""
-_WEIGHTS = {name for name, _, _, _ in (*_FIRST, *_LAYERS)}
 _SOFTNESS = (0.3, 30.0)  # degrees; the sun's is 0.27
 _MAX_SOURCES = 4
 _UNSEEN = 0.5  # share of unphotographed directions overhead above which the panel warns
@@ -67,42 +67,27 @@ class LightPanel(Panel):
 
     def build(self, form: Form) -> None:
         """Add the controls of the light and its strengths."""
-        session = self.editor.require_session()
-        light = self._light(session)
+        session, light = self.session, self._light()
         if light is None:
-            form.note(self._missing(session), name="light")
+            form.note(self._missing(), name="light")
         else:
-            form.check(
-                "sun",
-                "Set the sun by two clicks",
-                self._sets_sun,
-                self._toggle_sun,
-                hint="On what casts a shadow, then on the same point of its shadow",
-            )
-            self._build_sky(form, session, light)
-        for name, label, ends, hint in _FIRST:
-            self._weight(form, name, label, (*ends, 0.05), hint)
+            hint = "On what casts a shadow, then on the same point of its shadow"
+            form.check("sun", "Set the sun by two clicks", self._sets_sun, self._toggle_sun, hint=hint)
+            self._build_sky(form, light)
+        self._build_weights(form, _FIRST)
         if light is not None and light.sources:
-            softness = light.sources[self._chosen].angular_radius_deg
-            form.slider(
-                "softness", "Shadow softness", round(min(_SOFTNESS[1], max(_SOFTNESS[0], softness)), 1),
-                (*_SOFTNESS, 0.1),
-                lambda v: self._change(lambda s: replace(s, angular_radius_deg=float(v), uncertainty_deg=0.0)),
-                hint="Degrees that the chosen light seems wide",
-            )  # fmt: skip
-        form.button(
-            "estimate",
-            "Back to the estimate",
-            lambda: session.change(replace(session.state, light=None)),
-            disabled=session.state.light is None,
-        )
+            softness = round(min(_SOFTNESS[1], max(_SOFTNESS[0], light.sources[self._chosen].angular_radius_deg)), 1)
+            hint = "Degrees that the chosen light seems wide"
+            form.slider("softness", "Shadow softness", softness, (*_SOFTNESS, 0.1), self._soften, hint=hint)
+        is_set, forget = session.state.light is not None, lambda: session.change(replace(session.state, light=None))
+        form.button("estimate", "Back to the estimate", forget, disabled=not is_set)
         form.more()
         if light is not None and light.sources:
             self._build_sources(form, light)
-        for name, label, ends, hint in _LAYERS:
-            self._weight(form, name, label, (*ends, 0.05), hint)
+        self._build_weights(form, _LAYERS)
 
-    def _build_sky(self, form: Form, session: Session, light: Light) -> None:
+    def _build_sky(self, form: Form, light: Light) -> None:
+        session = self.session
         view = self.editor.editing()
         orbit = None if view is None else self.editor.orbit(view)
         ahead = torch.tensor([0.0, 1.0, 0.0]) if orbit is None else torch.tensor(orbit.forward).float()
@@ -115,140 +100,132 @@ class LightPanel(Panel):
         form.note(f"{by}: {found}.{doubt}", name="light")
 
     def _build_sources(self, form: Form, light: Light) -> None:
-        names = [f"{i + 1}: {s.name}" for i, s in enumerate(light.sources)]
-        self._chosen = min(self._chosen, len(names) - 1)
-        form.choice("source", "Light", names[self._chosen], names, lambda v: setattr(self, "_chosen", names.index(v)))
+        numbers = {f"{i + 1}: {source.name}": i for i, source in enumerate(light.sources)}
+        form.choice("source", "Light", self._chosen, numbers, self._sets("_chosen"))
         if light.sources != self._scaled:
             self._full, self._scaled = tuple(source.irradiance for source in light.sources), light.sources
         now, full = max(light.sources[self._chosen].irradiance), max(self._full[self._chosen])
         strength = min(3.0, round(now / full, 2)) if full > 0 else 1.0
         form.slider("strength", "Strength", strength, (0.0, 3.0, 0.05), self._scale)
 
-    def _weight(self, form: Form, name: str, label: str, ends: tuple[float, float, float], hint: str) -> None:
-        """Add the slider of a layer's weight."""
-        weight = getattr(self.editor.require_session().state.weights, name)
-        form.slider(name, label, weight, ends, lambda value: self._set_weight(name, value), hint=hint)
+    def _build_weights(self, form: Form, layers: Sequence[tuple[str, str, tuple[float, float], str]]) -> None:
+        """Add the sliders of layers' weights."""
+        for name, label, ends, hint in layers:
+            weight = getattr(self.session.state.weights, name)
+            form.slider(name, label, weight, (*ends, 0.05), partial(self._set_weight, name), hint=hint)
+            form.while_dragged(name, partial(self._show_weight, name))
 
-    def _light(self, session: Session) -> Light | None:
+    def _light(self) -> Light | None:
         """Return the light of a drag, the light set by hand, or the last estimate."""
-        state = self.editor.live or session.placed_state()
+        session = self.session
         if not session.objects() or not session.files.transfers_light:
             return None
-        if state.light is not None:
-            self._chosen = min(self._chosen, max(0, len(state.light.sources) - 1))
-            return state.light
-        relit = None if self.editor.pictures is None else self.editor.pictures.lit.relit(state)
-        found = None if relit is None else relit.light
-        self._chosen = min(self._chosen, max(0, len(found.sources) - 1)) if found is not None else 0
-        return found
+        state = self.editor.shown_state()
+        relit = self.pictures.lit.relit(state)
+        light = state.light if state.light is not None or relit is None else relit.light
+        self._chosen = 0 if light is None else min(self._chosen, max(0, len(light.sources) - 1))
+        return light
 
-    def _missing(self, session: Session) -> str:
+    def _missing(self) -> str:
         """Return the reason why no light is shown."""
+        session = self.session
         if not session.files.transfers_light:
             return "The light transfer is off in project.toml: the object is shown as it was captured."
         if not session.objects():
             return "No object is placed yet: see Place."
-        relit = None if self.editor.pictures is None else self.editor.pictures.lit.relit(session.placed_state())
+        relit = self.pictures.lit.relit(session.placed_state())
         return "Estimating the light." if relit is None else " ".join(one.text for one in relit.report)
 
     # strengths
 
-    def live(self, name: str, value: Any) -> None:
-        """Show a strength or a direction while it is dragged."""
-        if name == "sky":
-            self._drag_on_sky(value)
-        elif name in _WEIGHTS:
-            state = self.editor.require_session().placed_state()
-            self.editor.show_live(replace(state, weights=replace(state.weights, **{name: float(value)})))
+    def _show_weight(self, name: str, value: float) -> None:
+        weights = replace(self.session.state.weights, **{name: float(value)})
+        self.editor.show_live(replace(self.session.placed_state(), weights=weights))
 
     def _set_weight(self, name: str, value: float) -> None:
-        session = self.editor.require_session()
         self.editor.live = None
+        session = self.session
         session.change(replace(session.state, weights=replace(session.state.weights, **{name: float(value)})))
+
+    def _soften(self, value: float) -> None:
+        self._change(angular_radius_deg=float(value), uncertainty_deg=0.0)
 
     def _scale(self, value: float) -> None:
         r, g, b = (float(value) * part for part in self._full[self._chosen])
-        self._change(lambda source: replace(source, irradiance=(r, g, b)), keeps_strength=True)
+        self._change(irradiance=(r, g, b))
 
-    def _change(self, change: Any, *, keeps_strength: bool = True) -> None:
-        """Change the chosen source; strengths stay relative to `_full`."""
-        session = self.editor.require_session()
-        light = self._light(session)
+    def _change(self, **fields: Any) -> None:
+        """Change fields of the chosen source; strengths stay relative to `_full`."""
+        light = self._light()
         if light is not None and light.sources:
-            edited = with_source(light, self._chosen, change(light.sources[self._chosen]))
-            if keeps_strength:
-                self._scaled = edited.sources
-            session.change(replace(session.placed_state(), light=edited))
+            edited = with_source(light, self._chosen, replace(light.sources[self._chosen], **fields))
+            self._scaled = edited.sources
+            self._set(edited)
+
+    def _set(self, light: Light, *, live: bool = False) -> None:
+        """Save a light in one undo step, or only show it during a drag."""
+        edited = replace(self.session.placed_state(), light=light)
+        check_state(edited)
+        if live:
+            self.editor.show_live(edited)
+        else:
+            self.editor.live = None
+            self.session.change(edited)
 
     # directions
 
     def _drag_on_sky(self, given: tuple[int, float, float, bool]) -> None:
         """Move a light on the picture of the sky, to x and y in units of the horizon's radius."""
         index, x, y, is_end = given
-        session, dome = self.editor.require_session(), self._dome
-        light = self._light(session)
+        light, dome = self._light(), self._dome
         if dome is None or light is None or not 0 <= index < len(light.sources):
             raise ValueError("There is no such light.")
         self._chosen = index
-        self._move(with_direction(light, index, dome.direction(x, y)), ended=is_end)
-
-    def _move(self, light: Light, *, ended: bool) -> None:
-        """Show a light during a drag, and save it at the end in one undo step."""
-        session = self.editor.require_session()
-        edited = replace(session.placed_state(), light=light)
-        check_state(edited)
-        if ended:
-            self.editor.live = None
-            session.change(edited)
-        else:
-            self.editor.show_live(edited)
+        self._set(with_direction(light, index, dome.direction(x, y)), live=not is_end)
 
     def overlay(self, view: View, camera: Cameras) -> dict[str, Any]:
         """Describe the arrows of the lights and the points that set the sun."""
-        session = self.editor.require_session()
-        light = self._light(session)
-        if light is None or self.editor.kind != "With its new light":
+        light = self._light()
+        if light is None or self.editor.kind != "lit":
             return {}
-        centre, length = self._centre_and_length(session)
+        centre, length = self._centre_and_length()
         lines, dots = [], []
         for index, source in enumerate(light.sources[:_MAX_SOURCES]):
-            peak = max(*source.irradiance, 1e-9)
-            r, g, b = (round(255 * max(0.0, value / peak) ** (1 / 2.2)) for value in source.irradiance)
+            color = color_of(source)
             tail, head = on_canvas(arrow_points(source, centre, length), camera)
             if tail is not None and head is not None:
                 width = 6 if index == self._chosen else 3
-                lines.append({"points": [tail, head], "color": f"rgb({r},{g},{b})", "width": width, "arrow": True})
-                dots.append({"at": tail, "color": f"rgb({r},{g},{b})", "id": f"light:{index}"})
+                lines.append({"points": [tail, head], "color": color, "width": width, "arrow": True})
+                dots.append({"at": tail, "color": color, "id": f"light:{index}"})
         if self._sets_sun:
             at = on_canvas(torch.tensor(self._kept()).reshape(-1, 3), camera)
             dots += [{"at": point, "color": _MARK} for point in at if point is not None]
             lines += [{"points": [a, b], "color": _MARK} for a, b in zip(at[::2], at[1::2], strict=False) if a and b]
         return {"lines": lines, "dots": dots}
 
-    def _centre_and_length(self, session: Session) -> tuple[Float[Tensor, "3"], float]:
+    def _centre_and_length(self) -> tuple[Float[Tensor, "3"], float]:
         """Return the arrows' target, and the distance of their tails from it."""
-        base, placed = session.placeable_object(0).base, session.objects()[0].target_from_object
+        base, placed = self.session.placeable_object(0).base, self.session.objects()[0].target_from_object
         length = 3.0 * placed.scale * max(base.height, base.radius)
         return placed.points(base.point + 0.5 * base.height * base.up), length
 
     def pointer(self, view: View, pointer: Pointer) -> None:
         """Drag an arrow's tail, or set the sun."""
-        session = self.editor.require_session()
         if pointer.on.startswith("light:") and pointer.what == "down":
-            index, light = int(pointer.on.removeprefix("light:")), self._light(session)
+            index, light = int(pointer.on.removeprefix("light:")), self._light()
             if light is not None and 0 <= index < len(light.sources):
                 self._chosen = index
-                tail = arrow_points(light.sources[index], *self._centre_and_length(session))[0]
-                self._handle = (index, Corner(tail, view_camera(self.editor, view)))
+                tail = arrow_points(light.sources[index], *self._centre_and_length())[0]
+                self._handle = (index, Corner(tail, self.camera(view)))
         elif self._handle is not None and pointer.what in ("move", "up", "cancel"):
-            (index, corner), light = self._handle, self._light(session)
+            (index, corner), light = self._handle, self._light()
             if pointer.what != "move":
                 self._handle = None
             if pointer.what == "cancel" or light is None:
                 self.editor.show_live(None)
             else:
-                towards = corner.at(pointer.place) - self._centre_and_length(session)[0]
-                self._move(with_direction(light, index, towards), ended=pointer.what == "up")
+                towards = corner.at(pointer.place) - self._centre_and_length()[0]
+                self._set(with_direction(light, index, towards), live=pointer.what != "up")
         elif pointer.what == "click" and self._sets_sun:
             self._add_point(view, pointer)
 
@@ -262,7 +239,7 @@ class LightPanel(Panel):
 
     def _kept(self) -> tuple[Point, ...]:
         """Return the points set under the current light."""
-        return self._points if self.editor.require_session().state.light is self._set_light else ()
+        return self._points if self.session.state.light is self._set_light else ()
 
     def _toggle_sun(self, value: bool) -> None:
         self._sets_sun = value
@@ -270,7 +247,7 @@ class LightPanel(Panel):
             self.editor.say("click what casts a shadow in the scene, such as the corner of a table")
 
     def _add_point(self, view: View, pointer: Pointer) -> None:
-        session, ray = self.editor.require_session(), pointer.ray(view_camera(self.editor, view))
+        session, ray = self.session, Ray.through(pointer.place, self.camera(view))
         state, files = session.placed_state(), session.files
         scene = session.scenes.gaussians(files.target_scene)
         if state.erased is not None:
@@ -284,9 +261,9 @@ class LightPanel(Panel):
             self._points, self._set_light = points, session.state.light
             self.editor.say("now click the same point of its shadow")
             return
-        self._points, light = points[:-2], self._light(session)
+        self._points, light = points[:-2], self._light()
         if light is None:
-            raise ValueError(self._missing(session))
+            raise ValueError(self._missing())
         captured = CapturedScene(scene, session.scenes.cameras(files.target_cameras), session.scenes.target_clock())
         sun = set_sun(points, captured)
         session.change(replace(state, light=with_sun(light, sun)))

@@ -1,5 +1,6 @@
 """The step `Open`: create a project from two captures or scenes, and reconstruct missing scenes."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,24 +81,22 @@ class OpenPanel(Panel):
             return
         form.note(_HELP, name="help")
         for name in _SIDES:
-            form.text(name, _FIELDS[name], self._paths[name], partial(self._set, name), hint="A path", browse=True)
-            self._on_browse(form, name)
+            self._add_path(form, name, "A path")
             found = self._found[name]
-            form.note(
-                "" if found is None else found.text, name=f"found_{name}", bad=bool(found and not found.is_usable)
-            )
-            form.upload(
-                f"upload_{name}", "Upload photos, a video or a scene", (*_PHOTOS, *_VIDEOS, *SCENE_SUFFIXES), many=True
-            )
+            if found is not None:
+                form.note(found.text, name=f"found_{name}", bad=not found.is_usable)
+            suffixes = (*_PHOTOS, *_VIDEOS, *SCENE_SUFFIXES)
+            form.upload(f"upload_{name}", "Upload photos, a video or a scene", suffixes, many=True)
         usable = all(found is not None and found.is_usable for found in self._found.values())
         form.button("start", "Start the project", self._create, main=True, disabled=not usable)
         form.more()
         for name in ("source_scene", "target_scene"):
-            form.text(name, _FIELDS[name], self._paths[name], partial(self._set, name), hint=_TRAINED_HINT, browse=True)
-            self._on_browse(form, name)
+            self._add_path(form, name, _TRAINED_HINT)
 
-    def _on_browse(self, form: Form, name: str) -> None:
+    def _add_path(self, form: Form, name: str, hint: str) -> None:
+        """Add the field of a path, with a button that lists the folder of its present value."""
         given = self._paths[name]
+        form.text(name, _FIELDS[name], given, partial(self._set, name), hint=hint, browse=True)
         start = Path(given).expanduser() if given and Path(given).expanduser().is_absolute() else Path.home()
         start = next(folder for folder in (start, *start.parents) if folder.is_dir())
         form.hidden(f"browse_{name}", lambda: setattr(self, "_browsed", (name, start)))
@@ -110,8 +109,7 @@ class OpenPanel(Panel):
             if path.is_dir():
                 self._browsed = (name, path)
             else:
-                self._browsed = None
-                self._set(name, str(path))
+                self._use(name, path)
 
         form.note(f"{_FIELDS[name]}: {folder}", name="folder")
         form.button("use_folder", "Use this folder", partial(self._use, name, folder), main=True)
@@ -128,9 +126,9 @@ class OpenPanel(Panel):
         rows = [f"{p.name}/" if p.is_dir() else p.name for p in shown[:_MAX_ROWS]]
         form.rows("entries", ["..", *rows], go)
 
-    def _use(self, name: str, folder: Path) -> None:
+    def _use(self, name: str, path: Path) -> None:
         self._browsed = None
-        self._set(name, str(folder))
+        self._set(name, str(path))
 
     def _set(self, name: str, value: str) -> None:
         self._paths[name] = value.strip()
@@ -147,10 +145,10 @@ class OpenPanel(Panel):
     def _create(self) -> None:
         captures = parse_path(self._paths["source"]), parse_path(self._paths["target"])
         names = ("source_scene", "target_scene")
-        scenes = [parse_path(self._paths[name]) if self._paths[name] else None for name in names]
-        self.editor.project.create(captures, scenes=(scenes[0], scenes[1]))
+        first, second = (parse_path(self._paths[name]) if self._paths[name] else None for name in names)
+        self.editor.project.create(captures, scenes=(first, second))
         self.editor.open_project()
-        session = self.editor.require_session()
+        session = self.session
         if all(session.files.without_photos):
             # importing two scenes takes no training, so it starts at once
             self.editor.run("reconstruct", _title(session))
@@ -169,7 +167,7 @@ class OpenPanel(Panel):
         files = session.files
         for index, side in enumerate(_SIDES):
             form.note(self._line(session, index), name=f"facts_{side}")
-        have_both = files.source_scene.is_file() and files.target_scene.is_file()
+        have_both = files.have_both_scenes
         why = session.why_stale(*(f"{side}/reconstruct" for side in _SIDES)) if have_both else None
         form.note("" if why is None else f"Out of date: {why}", name="stale")
         if not have_both or why is not None:
@@ -185,23 +183,13 @@ class OpenPanel(Panel):
         ups = dict(_UPS)
         if views.up not in ups.values():
             ups[f"({', '.join(f'{x:g}' for x in views.up or ())})"] = views.up
-        up = next(name for name, value in ups.items() if value == views.up)
-        look = next(name for name, value in _LOOKS.items() if value == views.is_within)
 
-        def set_views(made: RenderedViews) -> None:
-            self.editor.require_session().set_view(side, made)
+        def set_views(field: str, value: object) -> None:
+            self.session.set_view(side, replace(views, **{field: value}))
             self.editor.run("reconstruct", "Render the scene again")
 
-        form.choice(
-            f"look_{side}",
-            f"Cameras: {side}",
-            look,
-            list(_LOOKS),
-            lambda v: set_views(RenderedViews(views.up, _LOOKS[v])),
-        )
-        form.choice(
-            f"up_{side}", f"Up: {side}", up, list(ups), lambda v: set_views(RenderedViews(ups[v], views.is_within))
-        )
+        form.choice(f"look_{side}", f"Cameras: {side}", views.is_within, _LOOKS, partial(set_views, "is_within"))
+        form.choice(f"up_{side}", f"Up: {side}", views.up, ups, partial(set_views, "up"))
 
     def _line(self, session: Session, index: int) -> str:
         files, name = session.files, _FIELDS[_SIDES[index]]

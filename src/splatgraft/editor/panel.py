@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +16,8 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.editor.drag import Corner, on_canvas
 from splatgraft.editor.form import Form
 from splatgraft.editor.jobs import JobState
-from splatgraft.editor.picking import Ray
+from splatgraft.editor.pictures import Pictures
+from splatgraft.editor.session import Session
 from splatgraft.editor.stream import View
 from splatgraft.segmentation import Box
 
@@ -65,12 +68,6 @@ class Pointer:
         """Position over the canvas's sides."""
         return self.x, self.y
 
-    def ray(self, camera: Cameras) -> Ray:
-        """Return the ray through the pointer."""
-        k, pose = camera.intrinsics[0], camera.world_from_camera[0]
-        pixel = torch.tensor([self.x * camera.width, self.y * camera.height, 1.0])
-        return Ray(pose[:3, 3], pose[:3, :3] @ (torch.linalg.inv(k) @ pixel))
-
 
 class Panel:
     """One step of the workflow."""
@@ -78,6 +75,27 @@ class Panel:
     def __init__(self, editor: Editor) -> None:
         """Attach to an editor."""
         self.editor = editor
+
+    @property
+    def session(self) -> Session:
+        """The open project; raises ValueError if no project is open."""
+        return self.editor.require_session()
+
+    def _sets(self, name: str) -> Callable[[Any], None]:
+        """Return the handler of a control that sets a field of this panel."""
+        return partial(setattr, self, name)
+
+    @property
+    def pictures(self) -> Pictures:
+        """Pictures of the open project."""
+        return self.session.pictures
+
+    def camera(self, view: View) -> Cameras:
+        """Return the camera of a window's full picture; raise ValueError if it shows no scene."""
+        orbit = self.editor.orbit(view)
+        if orbit is None or not all(view.size):
+            raise ValueError("view: expected a scene in view, found none")
+        return orbit.camera(*view.canvas)
 
     def enter(self) -> None:
         """Set up the step when it is shown."""
@@ -111,22 +129,11 @@ class Panel:
         """Handle a key; return whether this step uses it."""
         return False
 
-    def live(self, name: str, value: Any) -> None:
-        """Show a value of a slider while it is dragged."""
-
     def uploaded(self, path: Path, use: str) -> None:
         """Use a file that was uploaded for a control."""
 
     def job_ended(self, job: JobState) -> None:
         """Update the step after a job has ended; called for all steps."""
-
-
-def view_camera(editor: Editor, view: View) -> Cameras:
-    """Return the camera of a window's full picture."""
-    orbit = editor.orbit(view)
-    if orbit is None or not all(view.size):
-        raise ValueError("view: expected a scene in view, found none")
-    return orbit.camera(*view.canvas)
 
 
 class BoxDrag:

@@ -77,6 +77,13 @@ class Ray:
     direction: Float[Tensor, "3"]
     """Direction, of any length."""
 
+    @staticmethod
+    def through(place: tuple[float, float], camera: Cameras) -> "Ray":
+        """Return the ray through a position over the canvas's sides, with a direction of depth 1."""
+        k, pose = camera.intrinsics[0], camera.world_from_camera[0]
+        pixel = torch.tensor([place[0] * camera.width, place[1] * camera.height, 1.0])
+        return Ray(pose[:3, 3], pose[:3, :3] @ (torch.linalg.inv(k) @ pixel))
+
 
 def brush_selection(gaussians: Gaussians, rays: Sequence[Ray], *, size: float) -> Bool[Tensor, "n"]:
     """Flag the Gaussians in a stroke; `size` is the diameter of the brush over the distance of the hit point."""

@@ -88,6 +88,11 @@ class ProjectFiles:
     """Placement options of [compose], for objects without a placement."""
 
     @property
+    def have_both_scenes(self) -> bool:
+        """Whether both reconstructions exist."""
+        return self.source_scene.is_file() and self.target_scene.is_file()
+
+    @property
     def transfers_light(self) -> bool:
         """Whether the physical light transfer is used, so that there is a light to estimate and edit."""
         return self.light_mode == "transfer"

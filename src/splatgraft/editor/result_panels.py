@@ -13,8 +13,7 @@ from splatgraft.core.images import write_image
 from splatgraft.editor import sharing
 from splatgraft.editor.form import Form
 from splatgraft.editor.jobs import JobState
-from splatgraft.editor.panel import Panel, view_camera
-from splatgraft.editor.project import ExportPage
+from splatgraft.editor.panel import Panel
 from splatgraft.editor.server import FILES_PREFIX
 from splatgraft.editor.session import Session
 from splatgraft.exports.export import Layer
@@ -42,24 +41,21 @@ class RunPanel(Panel):
         """Show the result, if it exists."""
         session = self.editor.session
         if session is not None and session.files.result.is_file():
-            self.editor.before, self.editor.kind = "Pasted, unlit", "Result"
+            self.editor.before, self.editor.kind = "pasted", "result"
 
     def build(self, form: Form) -> None:
         """Say whether the result is up to date, and add the controls."""
-        session = self.editor.require_session()
+        session, sets = self.session, self._sets("_with_report")
         form.note(self._said(session), name="result")
         form.button("run", _LABEL, lambda: self.editor.run(self._last_step(), _LABEL), main=True)
         form.more()
-        method = session.state.harmonizer or "none"
-        form.choice(
-            "method", "Image model", method, tuple(HARMONIZERS),
-            lambda value: session.change(replace(session.state, harmonizer=value)),
-        )  # fmt: skip
-        form.check("with_report", "With the report", self._with_report, self._set_report, hint="Numbers and pictures")
+        method, methods = session.state.harmonizer or "none", {name: name for name in HARMONIZERS}
+        form.choice("method", "Image model", method, methods, self._set_method)
+        form.check("with_report", "With the report", self._with_report, sets, hint="Numbers and pictures")
         form.note(_command_line(session.project.run_words(self._last_step())), name="command", faint=True)
 
-    def _set_report(self, value: bool) -> None:
-        self._with_report = value
+    def _set_method(self, name: str) -> None:
+        self.session.change(replace(self.session.state, harmonizer=name))
 
     def job_ended(self, job: JobState) -> None:
         """Show the result that a job has just made."""
@@ -85,21 +81,20 @@ class SharePanel(Panel):
     def __init__(self, editor: "Editor") -> None:
         """Start with the first kind of file and the first part."""
         super().__init__(editor)
-        self._kind, self._part = next(iter(sharing.SHARE_KINDS)), next(iter(sharing.PARTS))
+        self._kind = next(iter(sharing.SHARE_KINDS.values()))
+        self._part: Layer = "all"
         self._asked = 0
         """Process id of the job that writes a file for the window."""
 
     def build(self, form: Form) -> None:
         """Add the kinds of files, the command, and the list of files."""
-        session = self.editor.require_session()
-        kind = sharing.SHARE_KINDS[self._kind]
+        session, kind = self.session, self._kind
         why_not = sharing.why_not(session.files, kind)
-        to, page, layer = self._wanted()
-        shown = sharing.step_shown(session.files, is_report=page == "report")
+        shown = sharing.step_shown(session.files, is_report=kind.page == "report")
         why = None if why_not is not None else session.why_stale(shown)
-        what = "The report" if page == "report" else "The result"
+        what = "The report" if kind.page == "report" else "The result"
         form.note("" if why is None else f"{what} is out of date: {why}. See Run.", name="stale", bad=True)
-        form.choice("kind_of_file", "As", self._kind, tuple(sharing.SHARE_KINDS), lambda v: setattr(self, "_kind", v))
+        form.choice("kind_of_file", "As", kind, sharing.SHARE_KINDS, self._sets("_kind"))
         form.note(why_not or "", name="share")
         form.button("write", "Write and download", self._start, main=True, disabled=why_not is not None)
         job = session.jobs.state()
@@ -109,23 +104,21 @@ class SharePanel(Panel):
         form.links("written", self._links(session))
         form.more()
         if kind.page == "viewer":
-            form.choice(
-                "part", "Part", self._part, tuple(sharing.PARTS), lambda value: setattr(self, "_part", value),
-                hint="Parts share the place's frame; pictures of them have alpha",
-            )  # fmt: skip
-        form.note(_command_line(session.project.export_words(to, page=page, layer=layer)), name="command", faint=True)
+            hint = "Parts share the place's frame; pictures of them have alpha"
+            form.choice("part", "Part", self._part, sharing.PARTS, self._sets("_part"), hint=hint)
+        form.note(_command_line(self._wanted()[1]), name="command", faint=True)
 
-    def _wanted(self) -> tuple[Path, ExportPage, Layer]:
-        """Return the file to write, its page and its layer."""
-        kind = sharing.SHARE_KINDS[self._kind]
-        layer = sharing.PARTS[self._part] if kind.page == "viewer" else "all"
-        return sharing.export_path(self.editor.require_session().files, kind, layer), kind.page, layer
+    def _wanted(self) -> tuple[Path, tuple[str, ...]]:
+        """Return the file to write and the arguments of `splatgraft` that write it."""
+        kind, session = self._kind, self.session
+        layer: Layer = self._part if kind.page == "viewer" else "all"
+        to = sharing.export_path(session.files, kind, layer)
+        return to, session.project.export_words(to, page=kind.page, layer=layer)
 
     def _start(self) -> None:
-        to, page, layer = self._wanted()
-        session = self.editor.require_session()
+        (to, words), session = self._wanted(), self.session
         to.parent.mkdir(parents=True, exist_ok=True)
-        session.start_job(session.project.export_words(to, page=page, layer=layer), f"Write {to.name}")
+        session.start_job(words, f"Write {to.name}")
         job = session.jobs.state()
         self._asked = 0 if job is None else job.pid
         self.editor.say(f"{to.name}: being written; you can go on meanwhile")
@@ -139,7 +132,7 @@ class SharePanel(Panel):
             self.editor.say(f"{job.title}: cancelled; nothing was written")
         if job.outcome != "done":
             return
-        session, path = self.editor.require_session(), Path(job.command[job.command.index("--to") + 1])
+        session, path = self.session, Path(job.command[job.command.index("--to") + 1])
         if asked == job.pid:
             self._offer(path)
         said = "; ".join(sentence.removeprefix(f"{path}: ") for sentence in job.said)
@@ -153,10 +146,10 @@ class SharePanel(Panel):
 
     def _send_picture(self) -> None:
         editor = self.editor
-        view, path = editor.editing(), editor.require_session().files.root / EXPORTS_FOLDER / _PICTURE
+        view, path = editor.editing(), self.session.files.root / EXPORTS_FOLDER / _PICTURE
         if view is None:
             return
-        camera = view_camera(editor, view)
+        camera = self.camera(view)
         pixels = editor.draw_target(replace(view, split=0.0), camera.resized(_SAVED_WIDTH / camera.width))[0]
         path.parent.mkdir(parents=True, exist_ok=True)
         write_image(path, torch.from_numpy(pixels.astype(np.float32) / 255))

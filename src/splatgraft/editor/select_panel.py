@@ -1,6 +1,7 @@
 """The step `Select`: select the object by clicks in photos or in the scene, by masks or a box, and by a brush."""
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -11,10 +12,9 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.form import Form
-from splatgraft.editor.panel import CORNERS, BoxDrag, Panel, Pointer, box_over, view_camera
+from splatgraft.editor.panel import CORNERS, BoxDrag, Panel, Pointer, box_over
 from splatgraft.editor.photo_view import PhotoView, prompt_of, seen_best, with_click
 from splatgraft.editor.picking import Ray, Rectangle, brush_selection, first_surface_hit, in_rectangle, interpolate_rays
-from splatgraft.editor.session import Session
 from splatgraft.editor.state import EditState
 from splatgraft.editor.stream import View
 from splatgraft.editor.worker import LatestOnlyWorker
@@ -66,82 +66,54 @@ class SelectPanel(Panel):
 
     def build(self, form: Form) -> None:
         """Add the controls."""
-        editor, session = self.editor, self.editor.require_session()
+        editor, session = self.editor, self.session
         if not session.files.source_scene.is_file():
             form.note("The scene with the object is not there yet: see Open.")
             return
         state, selection = session.state, session.selection()
-        form.note(self._said(session, bool(selection is not None and selection.any())), name="selection")
-        for line in self._warnings(session):
-            form.note(line, name="warning", bad=True)
-        marks = ("the object", "what is beside it")
-        form.choice(
-            "marks", "A click marks", marks[not self._marks_object], marks,
-            lambda value: setattr(self, "_marks_object", value == marks[0]),
-            hint="Alt or the right button: what is beside it",
-        )  # fmt: skip
+        form.note(self._said(bool(selection is not None and selection.any())), name="selection")
+        form.note(self._missing_masks(), name="warning", bad=True)
+        marks, hint = {"the object": True, "what is beside it": False}, "Alt or the right button: what is beside it"
+        form.choice("marks", "A click marks", self._marks_object, marks, self._sets("_marks_object"), hint=hint)
         editor.add_photos(form)
         form.button("cut", "Cut out the object", lambda: editor.run("segment", "Cut out the object"), main=True)
-        form.check(
-            "brush",
-            "Brush",
-            self._uses_brush,
-            self._use_brush,
-            hint="Drag over the picture (B); Shift and drag: a rectangle",
-        )
-        strokes = ("removes", "adds")
+        hint = "Drag over the picture (B); Shift and drag: a rectangle"
+        form.check("brush", "Brush", self._uses_brush, self._use_brush, hint=hint)
         if self._uses_brush:
-            form.choice(
-                "stroke", "The brush", strokes[self._adds], strokes, lambda v: setattr(self, "_adds", v == strokes[1])
-            )
-        form.check("alone", "Object alone", self._is_alone, lambda value: setattr(self, "_is_alone", value))
+            strokes = {"removes": False, "adds": True}
+            form.choice("stroke", "The brush", self._adds, strokes, self._sets("_adds"))
+        form.check("alone", "Object alone", self._is_alone, self._sets("_is_alone"))
         form.more()
-        form.button("no_clicks", "Forget all clicks", lambda: self._set(prompts=None), disabled=state.prompts is None)
-        form.button(
-            "no_strokes", "Forget all strokes", lambda: self._set(corrections=None), disabled=state.corrections is None
-        )
-        form.slider(
-            "brush_size", "Brush size", self._brush_size, (0.01, 0.5, 0.01),
-            lambda value: setattr(self, "_brush_size", value), hint="Over the distance to the surface",
-        )  # fmt: skip
-        name = next(
-            (n for n, value in _SOURCES.items() if value == (state.mask_source or "auto")), next(iter(_SOURCES))
-        )
-        form.choice(
-            "outlines", "Outlines from", name, list(_SOURCES), lambda value: self._set(mask_source=_SOURCES[value])
-        )
-        keep = next((n for n, value in _KEEP.items() if value == (state.keep or get_args(Keep)[0])), next(iter(_KEEP)))
-        form.choice("keep", "Keep", keep, list(_KEEP), lambda value: self._set(keep=_KEEP[value]))
-        box = session.box()
-        form.check("box", "Box around the object", box is not None, self._toggle_box)
+        for name, label, field in (("no_clicks", "clicks", "prompts"), ("no_strokes", "strokes", "corrections")):
+            forget = partial(self._set, **{field: None})
+            form.button(name, f"Forget all {label}", forget, disabled=getattr(state, field) is None)
+        sizes, hint = (0.01, 0.5, 0.01), "Over the distance to the surface"
+        form.slider("brush_size", "Brush size", self._brush_size, sizes, self._sets("_brush_size"), hint=hint)
+        source, keep = state.mask_source or "auto", state.keep or get_args(Keep)[0]
+        form.choice("outlines", "Outlines from", source, _SOURCES, lambda value: self._set(mask_source=value))
+        form.choice("keep", "Keep", keep, _KEEP, lambda value: self._set(keep=value))
+        form.check("box", "Box around the object", state.box is not None, self._toggle_box)
         if state.box is not None:
-            numbers = state.box
-            form.numbers("box_from", "Box from", numbers[:3], lambda v: self._set(box=(*v, *numbers[3:])))
-            form.numbers("box_to", "Box to", numbers[3:], lambda v: self._set(box=(*numbers[:3], *v)))
-            form.buttons(
-                "box_parts",
-                {
-                    "Add what is in the box": lambda: self._box_corrects(True),
-                    "Remove it": lambda: self._box_corrects(False),
-                },
-            )
+            lower, upper = state.box[:3], state.box[3:]
+            form.numbers("box_from", "Box from", lower, lambda v: self._set(box=(*v, *upper)))
+            form.numbers("box_to", "Box to", upper, lambda v: self._set(box=(*lower, *v)))
+            parts = {"Add what is in the box": True, "Remove it": False}
+            form.buttons("box_parts", {label: partial(self._box_corrects, add) for label, add in parts.items()})
 
-    def _said(self, session: Session, is_any: bool) -> str:
+    def _said(self, is_any: bool) -> str:
         if not is_any:
             return "Click on the object, in two or three photos; then cut it out."
-        if session.scenes.segmented() is not None:
+        if self.session.scenes.segmented() is not None:
             return "The object is orange. Where it is wrong, click or brush, and cut it out again."
         return "What is in the box is orange. Cut it out, or click on the object in two or three photos first."
 
-    def _warnings(self, session: Session) -> list[str]:
-        """Return a warning about missing masks of the capture."""
-        missing = session.scenes.missing_masks(session.files.source_cameras)
-        if not missing:
-            return []
-        names = ", ".join(path.name for path in missing[:3]) + (
-            f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-        )
-        return [f"Mask {names} is missing." if len(missing) == 1 else f"Masks {names} are missing."]
+    def _missing_masks(self) -> str:
+        """Return a warning about missing masks of the capture; empty if there are none."""
+        missing = self.session.scenes.missing_masks(self.session.files.source_cameras)
+        names, more = ", ".join(path.name for path in missing[:3]), len(missing) - 3
+        if len(missing) < 2:
+            return f"Mask {names} is missing." if missing else ""
+        return f"Masks {names}{f' and {more} more' if more > 0 else ''} are missing."
 
     def tools(self) -> dict[str, Any]:
         """Offer strokes of the brush, and rectangles."""
@@ -151,38 +123,29 @@ class SelectPanel(Panel):
 
     def picture(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
         """Draw the source, or a photo of it, with the selection."""
-        session, pictures = self.editor.require_session(), self.editor.pictures
-        assert pictures is not None
-        which = session.selection()
+        which = self.session.selection()
         if self._touched is not None and which is not None:
             which = which | self._touched if self._adds else which & ~self._touched
-        return pictures.draw_source(which, camera, photo=view.photo, alone=self._is_alone), "full quality"
+        return self.pictures.draw_source(which, camera, photo=view.photo, alone=self._is_alone), "full quality"
 
     def overlay(self, view: View, camera: Cameras) -> dict[str, Any]:
         """Describe the clicks and their outline in a photo, or the box elsewhere."""
-        session, pictures = self.editor.require_session(), self.editor.pictures
-        assert pictures is not None
-        dots: list[dict[str, Any]] = []
-        lines: list[dict[str, Any]] = []
-        if view.photo is not None:
-            name = session.scenes.cameras(session.files.source_cameras).names[view.photo]
-            size = pictures.source_photo(view.photo)[1]
-            shown = PhotoView(size, (camera.width, camera.height))
-            prompt = prompt_of(session.state.prompts, name)
-            for points, color in ((prompt.inside, _GREEN), (prompt.outside, _RED)):
-                at = [shown.place_of(x / size[0], y / size[1]) for x, y in points.tolist()]
-                dots += [{"at": [round(x, 4), round(y, 4)], "color": color} for x, y in at]
-            lines = [
-                {"points": [shown.place_of(*point) for point in line], "color": _GREEN, "closed": True}
-                for line in self._outline(session, view.photo)
-            ]
-        elif (box := session.box()) is not None:
-            return box_over(box, camera, _ORANGE)
-        return {"dots": dots, "lines": lines}
+        session = self.session
+        if view.photo is None:
+            box = session.box()
+            return {"dots": [], "lines": []} if box is None else box_over(box, camera, _ORANGE)
+        name = session.scenes.cameras(session.files.source_cameras).names[view.photo]
+        (width, height), prompt = self.pictures.source_photo(view.photo)[1], prompt_of(session.state.prompts, name)
+        shown, dots = PhotoView((width, height), (camera.width, camera.height)), []
+        for points, color in ((prompt.inside, _GREEN), (prompt.outside, _RED)):
+            at = [shown.place_of(x / width, y / height) for x, y in points.tolist()]
+            dots += [{"at": [round(x, 4), round(y, 4)], "color": color} for x, y in at]
+        outline = [[shown.place_of(*point) for point in line] for line in self._outline(view.photo)]
+        return {"dots": dots, "lines": [{"points": one, "color": _GREEN, "closed": True} for one in outline]}
 
-    def _outline(self, session: Session, photo: int) -> list[list[tuple[float, float]]]:
+    def _outline(self, photo: int) -> list[list[tuple[float, float]]]:
         """Return the outline in a photo; start its computation if it is not known yet."""
-        state = session.state
+        state = self.session.state
         if not state.prompts or state.mask_source not in _TAKES_POINTS:
             return []
         known, found = self._outlines
@@ -209,7 +172,7 @@ class SelectPanel(Panel):
     def pointer(self, view: View, pointer: Pointer) -> None:
         """Handle clicks, strokes, rectangles and drags of the box."""
         if pointer.what == "rectangle":
-            camera = view_camera(self.editor, view)
+            camera = self.camera(view)
             (x, y), (u, v) = pointer.place, pointer.to
             part = Rectangle((min(x, u), min(y, v)), (max(x, u), max(y, v)))
             self._correct(in_rectangle(self._scene().means, camera, part), add=self._adds != pointer.alt)
@@ -222,8 +185,7 @@ class SelectPanel(Panel):
 
     def _mark(self, view: View, pointer: Pointer) -> None:
         """Add a point to the photo in view, or to the one with the most similar direction, and show it."""
-        editor, session, pictures = self.editor, self.editor.require_session(), self.editor.pictures
-        assert pictures is not None
+        session, pictures = self.session, self.pictures
         cameras, photo = session.scenes.cameras(session.files.source_cameras), view.photo
         if photo is not None:
             size = pictures.source_photo(photo)[1]
@@ -231,7 +193,7 @@ class SelectPanel(Panel):
             if pixel is None:
                 raise ValueError("Click in the photo, not beside it.")
         else:
-            ray = pointer.ray(view_camera(editor, view))
+            ray = Ray.through(pointer.place, self.camera(view))
             hit = first_surface_hit(self._scene(), ray.origin, ray.direction)
             if hit is None:
                 raise ValueError("Click on a surface: there is none under the pointer.")
@@ -239,7 +201,7 @@ class SelectPanel(Panel):
             size = pictures.source_photo(photo)[1]
             scale = size[0] / cameras[photo].width
             pixel = (pixel[0] * scale, pixel[1] * scale)
-            editor.to_photo(photo)
+            self.editor.to_photo(photo)
         on_object = self._marks_object != pointer.alt
         prompts = with_click(
             session.state.prompts, cameras.names[photo], pixel, on_object=on_object, longer_side=max(size)
@@ -249,13 +211,12 @@ class SelectPanel(Panel):
         count = sum(len(p.inside) + len(p.outside) for p in (prompts or {}).values())
         clicks = "1 click" if count == 1 else f"{count} clicks"
         others = "" if takes else "; outlines are found by clicks now"
-        again = "Press Cut out." if session.scenes.segmented() is None else "Cut out again to use them."
-        editor.say(f"{clicks} in {len(prompts or {})} of the photos{others}. {again}")
+        self.editor.say(f"{clicks} in {len(prompts or {})} of the photos{others}. {self._again('them')}")
 
     def _drag_box(self, view: View, pointer: Pointer) -> None:
-        box, held = self.editor.require_session().box(), self._held_box
+        box, held = self.session.box(), self._held_box
         if pointer.what == "down" and box is not None:
-            self._held_box = BoxDrag(box, pointer.on, view_camera(self.editor, view))
+            self._held_box = BoxDrag(box, pointer.on, self.camera(view))
         elif held is not None and pointer.what != "move":
             self._held_box = None
             if pointer.what == "up":
@@ -272,7 +233,7 @@ class SelectPanel(Panel):
         self.editor.say(on if value else "the brush is off")
 
     def _paint(self, view: View, pointer: Pointer) -> None:
-        ray = pointer.ray(view_camera(self.editor, view))
+        ray = Ray.through(pointer.place, self.camera(view))
         if pointer.what in ("down", "click"):
             self._stroke, self._touched = [ray], torch.zeros(self._scene().count, dtype=torch.bool)
             new = [ray]
@@ -294,10 +255,12 @@ class SelectPanel(Panel):
             self._correct(touched, add=self._adds != pointer.alt)
 
     def _correct(self, touched: Tensor, *, add: bool) -> None:
-        session = self.editor.require_session()
-        session.correct(touched, add=add)
-        again = "Press Cut out." if session.scenes.segmented() is None else "Cut out again to use it."
-        self.editor.say(f"{'added' if add else 'removed'} what the stroke touched. {again}")
+        self.session.correct(touched, add=add)
+        self.editor.say(f"{'added' if add else 'removed'} what the stroke touched. {self._again('it')}")
+
+    def _again(self, what: str) -> str:
+        """Say how to use what was clicked or brushed."""
+        return "Press Cut out." if self.session.scenes.segmented() is None else f"Cut out again to use {what}."
 
     def key(self, view: View, key: str) -> bool:
         """Switch the brush on or off on B."""
@@ -310,20 +273,20 @@ class SelectPanel(Panel):
     def _toggle_box(self, value: bool) -> None:
         if not value:
             self._set(box=None)
-        elif self.editor.require_session().box() is None:
+        elif self.session.box() is None:
             self._set_box(self._default_box())
             self.editor.say(
                 "leave the photo by dragging the view; then drag the two corners until the box holds the object"
             )
 
     def _box_corrects(self, add: bool) -> None:
-        box = self.editor.require_session().box()
+        box = self.session.box()
         if box is not None:
             self._correct(box.contains(self._scene().means), add=add)
 
     def _default_box(self) -> Box:
         """Return the box around the cameras' focus, or the middle half of the scene if there is no capture."""
-        session = self.editor.require_session()
+        session = self.session
         try:
             return default_box(session.scenes.capture(session.files.source_cameras))
         except ValueError:
@@ -334,9 +297,9 @@ class SelectPanel(Panel):
         self._set(box=tuple(round(x, 6) for x in (*box.lower.tolist(), *box.upper.tolist())))
 
     def _set(self, **fields: object) -> None:
-        session = self.editor.require_session()
+        session = self.session
         session.change(replace(session.state, **fields))  # pyright: ignore[reportArgumentType]
 
     def _scene(self) -> Gaussians:
-        session = self.editor.require_session()
+        session = self.session
         return session.scenes.gaussians(session.files.source_scene)

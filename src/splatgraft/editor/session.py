@@ -15,18 +15,16 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.history import History, StateStore
 from splatgraft.editor.jobs import Jobs
+from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.placement import ObjectSize, PlaceableObject
 from splatgraft.editor.project import PROBLEM, Project, ProjectFiles, RenderedViews, in_words
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState, check_height_cm, check_state
-from splatgraft.editor.state_files import as_written, read_state, state_files, write_state
+from splatgraft.editor.state_files import as_written, read_state, stamps_of, write_state
 from splatgraft.project.layout import EDITOR_FOLDER, Side
 from splatgraft.project.metric_scale import MetricScale, read_scale, write_scale
 from splatgraft.project.placement import ObjectPlacement, read_placement
 from splatgraft.segmentation import Box, add_correction, apply_corrections
-
-Stamps = tuple[tuple[int, int] | None, ...]
-"""Time and size of each file of the edits; None for a missing file."""
 
 
 class Session:
@@ -44,6 +42,7 @@ class Session:
         self.project = project
         self.files: ProjectFiles = files
         self.scenes = SceneCache(files)
+        self.pictures = Pictures(self.scenes)
         self.jobs = Jobs(files.root / EDITOR_FOLDER)
         self._store = StateStore(files.root, project_folder=files.file.parent)
         self._stamps = stamps_of(files.file)
@@ -280,9 +279,3 @@ def disk_full(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
-
-
-def stamps_of(project: Path) -> Stamps:
-    """Return the current stamps of the edits' files."""
-    files = state_files(project)
-    return tuple((p.stat().st_mtime_ns, p.stat().st_size) if p.is_file() else None for p in files)

@@ -77,11 +77,9 @@ class SkyDome:
             x, y = (_RADIUS * value for value in self.point(torch.tensor(source.direction)))
             # share of the light on a surface that faces the source, as in `describe_light`
             share = sum(source.irradiance) / float(light.irradiance(torch.tensor(source.direction)[None]).sum())
-            peak = max(*source.irradiance, 1e-9)
-            r, g, b = (round(255 * max(0.0, value / peak) ** (1 / 2.2)) for value in source.irradiance)
             dots.append(
                 f'<circle class="light" data-source="{index}" cx="{x:.1f}" cy="{y:.1f}" '
-                f'r="{5 + 16 * math.sqrt(share):.1f}" fill="rgb({r},{g},{b})" stroke="#222" stroke-width="2">'
+                f'r="{5 + 16 * math.sqrt(share):.1f}" fill="{color_of(source)}" stroke="#222" stroke-width="2">'
                 f"<title>{html.escape(source.name)}, {self.words(source)}</title></circle>"
             )
         return (
@@ -108,3 +106,10 @@ class SkyDome:
         pixels = (255 * picture.reshape(_PIXELS, _PIXELS, 3)).round().byte().numpy()
         encoded = cv2.imencode(".png", np.ascontiguousarray(pixels[..., ::-1]))[1]
         return f"data:image/png;base64,{base64.b64encode(encoded.tobytes()).decode()}"
+
+
+def color_of(source: LightSource) -> str:
+    """Return a light's colour at full brightness, in CSS."""
+    peak = max(*source.irradiance, 1e-9)
+    r, g, b = (round(255 * max(0.0, value / peak) ** (1 / 2.2)) for value in source.irradiance)
+    return f"rgb({r},{g},{b})"

@@ -16,6 +16,8 @@ from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.settings import MAX_TEXT_BYTES, read_toml
 
+Stamps = tuple[tuple[int, int] | None, ...]
+"""Time and size of each file of the edits; None for a missing file."""
 _CORRECTIONS_FILE, _PROMPTS_FILE = "corrections.npy", "prompts.json"
 _KEYS_OF_FILES = {"corrections": "corrections", "prompts": "prompts", "given_light": "light"}
 """Keys of project.toml that name a file, with the field that it holds."""
@@ -99,6 +101,11 @@ def state_files(project: Path) -> tuple[Path, ...]:
     """Return all files that hold the state."""
     names = (PLACEMENT_FILE, ERASED_FILE, _CORRECTIONS_FILE, _PROMPTS_FILE, LIGHT_FILE)
     return (project, *(project.parent / name for name in names))
+
+
+def stamps_of(project: Path) -> Stamps:
+    """Return the current stamps of these files."""
+    return tuple((p.stat().st_mtime_ns, p.stat().st_size) if p.is_file() else None for p in state_files(project))
 
 
 def _keys(state: EditState) -> dict[tuple[str, str], Any]:

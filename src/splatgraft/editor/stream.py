@@ -10,15 +10,17 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from splatgraft.core.cameras import Cameras
 from splatgraft.editor.orbit import Orbit
 from splatgraft.editor.server import Window
+
+if TYPE_CHECKING:
+    from splatgraft.editor.editor import Editor
 
 _BUDGET_SECONDS = 1 / 20  # to draw a moving picture; sending and showing it takes the rest of 1/15 s
 _SMALLEST = 0.3  # share of the canvas's sides; smaller pictures take hardly less time, because all Gaussians are sorted
@@ -70,23 +72,11 @@ class View:
         return width, height
 
 
-class Artist(Protocol):
-    """Source of pictures, implemented by `Editor`."""
-
-    def draw(self, view: View, camera: Cameras) -> tuple[UInt8[np.ndarray, "h w 3"], dict[str, Any]]:
-        """Draw a window's view and its overlay."""
-        ...
-
-    def orbit(self, view: View) -> Orbit | None:
-        """Return a window's camera; None if there is no scene to show."""
-        ...
-
-
 class Stream:
     """The thread that draws for all windows, in turn."""
 
-    def __init__(self, artist: Artist, on_error: Callable[[Exception], None]) -> None:
-        """Start the thread without windows."""
+    def __init__(self, artist: "Editor", on_error: Callable[[Exception], None]) -> None:
+        """Start the thread without windows; `artist` gives cameras and pictures."""
         self._artist, self._on_error = artist, on_error
         self.views: list[View] = []
         """Views in the order in which their windows opened."""
