@@ -137,8 +137,9 @@ def test_what_a_window_sends_before_the_project_is_open_is_kept(tmp_path: Path) 
     with served() as server, Client(server.port).connect() as connection:
         connection.send("[1]")
         connection.send('{"t": "size", "w": 640, "h": 480}')
-        wait_until(lambda: len(server._early) == 1, what="the message")
+        wait_until(lambda: len(server._windows) == 1, what="the window")
         server.attach(Editor(tmp_path))
+        wait_until(lambda: bool(got), what="the message")
         assert got == [{"t": "size", "w": 640, "h": 480}]
 
 

@@ -320,7 +320,7 @@ def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(project: Path, m
         session, pictures = editor.require_session(), editor.pictures
         assert pictures is not None
         relit = RelitPreview(session.scenes).relit(session.placed_state())
-        pictures.lit.add(session.placed_state(), Lit("final", relit, 0.0))
+        pictures.lit.add(session.placed_state(), Lit("final", relit))
         window.step("Light")
         assert {name: window.control(name).get("value", 0.0) for name in asdict(LayerWeights())} == asdict(
             LayerWeights()

@@ -69,11 +69,11 @@ def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Ses
         picture = pictures.draw(kind, state, camera, 0)
         assert picture.shape == (camera.height, camera.width, 3)
         assert picture.std() > 1, kind
-    pictures.lit.add(state, Lit("final", light, 0.0))
+    pictures.lit.add(state, Lit("final", light))
     assert pictures.draw("shadow", state, camera).std() > 1
     assert pictures.lit.stage(state) == "final"
     # a draft that comes late does not replace it
-    pictures.lit.add(state, Lit("draft", light, 0.0))
+    pictures.lit.add(state, Lit("draft", light))
     assert pictures.lit.stage(state) == "final"
     assert pictures.lit.stage(moved(state)) == ""
 
@@ -82,7 +82,7 @@ def test_a_moved_object_keeps_its_colours_over_a_contact_shadow_until_its_light_
     session: Session, light: Relit
 ) -> None:
     lit, state = Pictures(session.scenes).lit, session.placed_state()
-    lit.add(state, Lit("final", light, 0.0))
+    lit.add(state, Lit("final", light))
     before, is_object = light.bake(state.weights)
     assert lit.scene(state) is lit.scene(state)
     assert torch.equal(lit.scene(state).sh, before.sh)

@@ -9,7 +9,9 @@ import hashlib
 import json
 import zlib
 from collections import OrderedDict
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -127,47 +129,42 @@ class StateStore:
 
 
 def _to_json(state: EditState, project_folder: Path) -> dict[str, Any]:
-    objects = None
-    if state.objects is not None:
-        objects = [
-            {
-                "scale": item.target_from_object.scale,
-                "rotation": item.target_from_object.rotation.tolist(),
-                "translation": item.target_from_object.translation.tolist(),
-                "object": None if item.object_path is None else relative_name(item.object_path, project_folder),
-            }
-            for item in state.objects
-        ]
+    """Convert a state to JSON's types, by field; None stays None."""
+    convert: dict[str, Callable[[Any], Any]] = {
+        "objects": lambda objects: [_object_to_json(item, project_folder) for item in objects],
+        "erased": _packed,
+        "corrections": _packed,
+        "prompts": prompts_to_json,
+        "light": light_to_json,
+        "weights": asdict,
+    }
+    return _converted({field.name: getattr(state, field.name) for field in fields(state)}, convert)
+
+
+def _from_json(content: dict[str, Any], project_folder: Path) -> EditState:
+    convert: dict[str, Callable[[Any], Any]] = {
+        "objects": lambda objects: tuple(_object_from_json(item, project_folder) for item in objects),
+        "erased": partial(_unpacked, kind=np.bool_),
+        "corrections": partial(_unpacked, kind=np.int8),
+        "box": tuple,
+        "prompts": partial(prompts_from_json, where="prompts"),
+        "light": light_from_json,
+        "weights": lambda weights: LayerWeights(**weights),
+    }
+    return EditState(**_converted(content, convert))
+
+
+def _converted(values: dict[str, Any], convert: Mapping[str, Callable[[Any], Any]]) -> dict[str, Any]:
     return {
-        "objects": objects,
-        "erased": _packed(state.erased),
-        "corrections": _packed(state.corrections),
-        "mask_source": state.mask_source,
-        "box": state.box,
-        "keep": state.keep,
-        "prompts": None if state.prompts is None else prompts_to_json(state.prompts),
-        "light": None if state.light is None else light_to_json(state.light),
-        "weights": asdict(state.weights),
-        "harmonizer": state.harmonizer,
+        name: value if value is None or name not in convert else convert[name](value) for name, value in values.items()
     }
 
 
-def _from_json(fields: dict[str, Any], project_folder: Path) -> EditState:
-    objects, box, prompts, light = (fields[name] for name in ("objects", "box", "prompts", "light"))
-    if objects is not None:
-        objects = tuple(_object_from_json(item, project_folder) for item in objects)
-    return EditState(
-        objects=objects,
-        erased=_unpacked(fields["erased"], np.bool_),
-        corrections=_unpacked(fields["corrections"], np.int8),
-        mask_source=fields["mask_source"],
-        box=None if box is None else (box[0], box[1], box[2], box[3], box[4], box[5]),
-        keep=fields["keep"],
-        prompts=None if prompts is None else prompts_from_json(prompts, "prompts"),
-        light=None if light is None else light_from_json(light),
-        weights=LayerWeights(**fields["weights"]),
-        harmonizer=fields["harmonizer"],
-    )
+def _object_to_json(item: ObjectPlacement, project_folder: Path) -> dict[str, Any]:
+    move = item.target_from_object
+    path = None if item.object_path is None else relative_name(item.object_path, project_folder)
+    rotation, translation = move.rotation.tolist(), move.translation.tolist()
+    return {"scale": move.scale, "rotation": rotation, "translation": translation, "object": path}
 
 
 def _object_from_json(fields: dict[str, Any], project_folder: Path) -> ObjectPlacement:
@@ -176,14 +173,12 @@ def _object_from_json(fields: dict[str, Any], project_folder: Path) -> ObjectPla
     return ObjectPlacement(placement, None if fields["object"] is None else project_folder / fields["object"])
 
 
-def _packed(flags: Tensor | None) -> str | None:
+def _packed(flags: Tensor) -> str:
     """Encode one byte per Gaussian as compressed text."""
-    return None if flags is None else base64.b64encode(zlib.compress(flags.numpy().tobytes())).decode()
+    return base64.b64encode(zlib.compress(flags.numpy().tobytes())).decode()
 
 
-def _unpacked(text: str | None, kind: type[np.generic]) -> Tensor | None:
-    if text is None:
-        return None
+def _unpacked(text: str, kind: type[np.generic]) -> Tensor:
     return torch.from_numpy(np.frombuffer(bytearray(zlib.decompress(base64.b64decode(text))), kind))
 
 

@@ -10,7 +10,6 @@ import pickle
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,8 +48,6 @@ class Lit:
     """Draft, all layers with the sources found before a move, or the step's result."""
     layers: Relit | Draft
     """Layers, without the Gaussians if it is a draft, which are those of the composite."""
-    seconds: float
-    """Computation time."""
 
 
 class LightProcess:
@@ -168,12 +165,11 @@ class _Computing:
             if self._drafts.wait_idle(_SETTLE_SECONDS):
                 self._relighting.prepare_drafts(state)
             return
-        start = time.monotonic()
         if self._scenes.files.transfers_light and not self._relighting.is_relit(state):
             draft = self._relighting.draft(state)
             none = draft.relit.gaussians.select(torch.zeros(0, dtype=torch.int64))
             sent = replace(_without_evidence(draft.relit), gaussians=none, objects=())
-            self._send(number, "draft", replace(draft, relit=sent), start)
+            self._send(number, "draft", replace(draft, relit=sent))
         if wanted == "final":
             self._lights.submit(asked)
 
@@ -181,19 +177,18 @@ class _Computing:
         number, state, _ = asked
         if not self._lights.wait_idle(_SETTLE_SECONDS) or number != self._number:
             return
-        start = time.monotonic()
         refined = self._relighting.refined(state)
         if refined is not None:
-            self._send(number, "refined", _without_evidence(refined), start)
+            self._send(number, "refined", _without_evidence(refined))
             if number != self._number:
                 return
-        self._send(number, "final", _without_evidence(self._relighting.relit(state)), start)
+        self._send(number, "final", _without_evidence(self._relighting.relit(state)))
         if self._lights.wait_idle(_SETTLE_SECONDS) and number == self._number:
             self._relighting.prepare_drafts(state)
 
-    def _send(self, number: int, stage: Stage, layers: Relit | Draft, start: float) -> None:
+    def _send(self, number: int, stage: Stage, layers: Relit | Draft) -> None:
         with self._lock:
-            _write(self._out, (number, Lit(stage, layers, time.monotonic() - start)))
+            _write(self._out, (number, Lit(stage, layers)))
 
     def _failed(self, error: Exception) -> None:
         with self._lock:
@@ -218,14 +213,13 @@ def main(arguments: list[str]) -> None:
 
 
 def _write(stream: IO[bytes], message: object) -> None:
-    content = pickle.dumps(message, protocol=5)
-    stream.write(len(content).to_bytes(8, "little"))
-    stream.write(content)
+    pickle.dump(message, stream, protocol=5)
     stream.flush()
 
 
 def _read(stream: IO[bytes]) -> Any:
     """Read the next message, which this program pickled itself; None at the end."""
-    head = stream.read(8)
-    content = stream.read(int.from_bytes(head, "little")) if len(head) == 8 else b""
-    return pickle.loads(content) if content else None
+    try:
+        return pickle.load(stream)
+    except (EOFError, pickle.UnpicklingError):  # the other process has ended, perhaps within a message
+        return None

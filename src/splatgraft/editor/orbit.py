@@ -9,9 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
-from splatgraft.core.cameras import Cameras
+from splatgraft.core.cameras import Cameras, pinhole
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.picking import first_surface_hit
+from splatgraft.editor.relit_preview import largest_coverage_indices
 
 Vector = Float[np.ndarray, "3"]
 _STEEPEST = math.radians(88.0)  # angle of the line of sight to the horizontal; up is undefined at 90 degrees
@@ -55,10 +56,8 @@ class Orbit:
     def camera(self, width: int, height: int) -> Cameras:
         """Return the camera of a canvas with the whole picture in its middle."""
         half = self.half_height * max(1.0, self.aspect * height / width if self.aspect else 1.0)
-        focal = height / (2 * half)
-        intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=torch.float32)
         pose = torch.tensor(self.world_from_camera, dtype=torch.float32)
-        return Cameras(pose[None], intrinsics[None], torch.tensor([[width, height]]), ("window",))
+        return pinhole(pose[None], height / (2 * half), width=width, height=height)
 
     def turned(self, dx: float, dy: float, *, up: Vector) -> "Orbit":
         """Turn around the pivot by a drag in units of the canvas's height."""
@@ -74,14 +73,8 @@ class Orbit:
 
     def moved(self, dx: float, dy: float) -> "Orbit":
         """Move sideways by a drag in units of the canvas's height; the pivot's plane follows the pointer."""
-        shift = (
-            -2
-            * self.half_height
-            * self.distance
-            * (dx * self.world_from_camera[:3, 0] + dy * self.world_from_camera[:3, 1])
-        )
-        pose = self.world_from_camera.copy()
-        pose[:3, 3] += shift
+        height, pose = 2 * self.half_height * self.distance, self.world_from_camera.copy()
+        pose[:3, 3] -= height * (dx * pose[:3, 0] + dy * pose[:3, 1])
         return replace(self, world_from_camera=pose)
 
     def zoomed(self, factor: float, *, scale: float) -> "Orbit":
@@ -136,9 +129,8 @@ class FreeSpace:
         floor, scale = float(heights.min()), typical_distance(cameras)
         if foot is not None:
             floor = min(floor, float(foot @ up) + _CLEAR * scale)
-        cover = torch.nn.functional.logsigmoid(scene.opacity_logits) + scene.log_scales.sort(1).values[:, 1:].sum(1)
-        chosen = cover.topk(min(_SURFACES, scene.count)).indices
-        return FreeSpace(up.double().numpy(), floor, scene.select(chosen).with_sh_degree(0), scale)
+        walls = scene.select(largest_coverage_indices(scene, _SURFACES)).with_sh_degree(0)
+        return FreeSpace(up.double().numpy(), floor, walls, scale)
 
     def kept(self, view: Orbit) -> Orbit:
         """Return the view, moved in front of walls and above the floor if necessary."""

@@ -39,6 +39,7 @@ from splatgraft.segmentation import CUT_SIDE_PX, grabcut_mask, seed_selection
 Kind = Literal["lit", "pasted", "result", "place", "shadow", "photo"]
 TINT = (1.0, 0.45, 0.1)
 """sRGB colour of the selection."""
+_RANKS = {"draft": 0, "refined": 1, "file": 2, "final": 2}  # of stages of the light; a later one is better
 _LONGEST_PX = 1920  # longer side of a photo; the browser enlarges it on a larger canvas
 _DARKEST = 0.5  # largest share of the light that a contact shadow removes
 _SHADOW_WIDTH = 0.35  # width of a contact shadow over the object's radius
@@ -90,13 +91,9 @@ class LitScenes:
     def add(self, state: EditState, lit: Lit) -> None:
         """Store layers of the light process unless better ones are known."""
         with self._lock:
-            order = ("draft", "refined", "final")
             now = self._now
-            is_worse = now is not None and now.relit is not None and now.fits(state) and now.stage in order
-            if is_worse and now is not None and order.index(lit.stage) < order.index(now.stage):
+            if now is not None and now.fits(state) and _RANKS[lit.stage] < _RANKS[now.stage]:
                 return
-            if now is not None and now.stage == "file" and now.fits(state) and lit.stage != "final":
-                return  # the finished result stays
             layers = lit.layers
             relit = layers.of_all(self._scenes.composite(state)) if isinstance(layers, Draft) else layers
             self._now = _LitState(state, lit.stage, relit)
@@ -114,7 +111,7 @@ class LitScenes:
         now = self._now
         if now is None or not now.fits(state):
             return ""
-        return "draft" if now.stage == "file" and not _same_weights(now.state, state) else now.stage
+        return "draft" if now.stage == "file" and now.state.weights != state.weights else now.stage
 
     def relit(self, state: EditState) -> Relit | None:
         """Return the layers of a state; None if they are not known yet."""
@@ -249,10 +246,6 @@ def _moved_by(move: Similarity, gaussians: Gaussians) -> Gaussians:
         return move.gaussians(gaussians)
     log_scales = gaussians.log_scales + math.log(move.scale)
     return replace(gaussians, means=move.points(gaussians.means), log_scales=log_scales)
-
-
-def _same_weights(a: EditState, b: EditState) -> bool:
-    return a.weights == b.weights
 
 
 def _darken(

@@ -11,7 +11,6 @@ import json
 import socket
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -23,7 +22,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
-from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from splatgraft.editor.access import allowed_query, cookie_name, why_refused
 from splatgraft.runtime.files import atomic_write
@@ -43,11 +42,13 @@ _TYPES = {
     ".mp4": "video/mp4",
 }
 _POLICY = "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'"
+_HEADERS = {"X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
+"""Headers against frames of other sites (clickjacking), and against leaks of the token in the address."""
 _MAX_MESSAGE_BYTES = 1 << 16  # a page's largest message is a path or a file's name
 _MAX_UPLOAD_BYTES = 1 << 30  # one upload, which is written to disk
 _MAX_WINDOWS = 16  # each takes drawing time
 _MAX_UPLOADS = 4  # at the same time
-_MAX_EARLY = 64  # messages kept until a client is attached; a page sends two when it opens
+_ATTACHED_SECONDS = 0.05  # pause between looks for a client, while the project is loaded
 _NOT_OURS = (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError)
 """Errors that an invalid message can raise."""
 _START_SECONDS = 60  # limit against a hang
@@ -115,10 +116,8 @@ class Server:
         self._token = token
         self._client: Client | None = None
         self._windows: list[Window] = []
-        self._early: deque[tuple[Window, dict[str, Any]]] = deque(maxlen=_MAX_EARLY)
-        """Messages of windows that opened before a client was attached, such as the size of their canvas."""
         self._numbers = itertools.count(1)
-        self._connections, self._uploads = 0, 0
+        self._uploads = 0
         self._lock = threading.Lock()
         listener = _listener(host, port)
         self.port: int = listener.getsockname()[1]
@@ -140,15 +139,11 @@ class Server:
         self._thread.start()
 
     def attach(self, client: Client) -> None:
-        """Send events of windows to a client from now on, first those of open windows."""
+        """Send events of windows to a client from now on; what open windows have sent so far has waited for it."""
         with self._lock:
             self._client = client
             for window in self._windows:
                 client.opened(window)
-            for window, message in self._early:
-                if window in self._windows:
-                    _pass_on(client, window, message)
-            self._early.clear()
 
     def close(self) -> None:
         """Stop the server."""
@@ -161,8 +156,7 @@ class Server:
         name = _ASSETS.get(request.path_params["name"])
         if name is None:
             return _no_file()
-        query = request.url.query
-        allowed = allowed_query(f"/?{query}" if query else "/")
+        allowed = allowed_query(f"/?{request.url.query}")
         if allowed is not None:
             return RedirectResponse(allowed, 302)
         content = resources.files("splatgraft.editor").joinpath("static", name).read_bytes()
@@ -214,11 +208,10 @@ class Server:
     async def _socket(self, connection: WebSocket) -> None:
         """Serve one window until it closes."""
         await connection.accept()
-        if self._connections >= _MAX_WINDOWS:
+        if len(self._windows) >= _MAX_WINDOWS:
             reason = f"splatgraft: expected at most {_MAX_WINDOWS} windows, found one more; close another"
             await connection.close(1013, reason)
             return
-        self._connections += 1
         window = Window(next(self._numbers), asyncio.get_running_loop())
         pump = asyncio.create_task(window.pump(connection))
         try:
@@ -226,12 +219,13 @@ class Server:
                 self._windows.append(window)
                 if self._client is not None:
                     self._client.opened(window)
-            while connection.application_state is WebSocketState.CONNECTED:
-                await self._take(window, await connection.receive())
+            while self._client is None:
+                await asyncio.sleep(_ATTACHED_SECONDS)
+            while True:
+                _pass_on(self._client, window, await connection.receive())
         except WebSocketDisconnect:
             pass
         finally:
-            self._connections -= 1
             pump.cancel()
             with contextlib.suppress(asyncio.CancelledError, Exception):
                 await pump
@@ -240,33 +234,17 @@ class Server:
                 if self._client is not None:
                     self._client.closed(window)
 
-    async def _take(self, window: Window, event: Any) -> None:
-        if event["type"] == "websocket.disconnect":
-            raise WebSocketDisconnect(event.get("code", 1000))
-        try:
-            message = dict(json.loads(event.get("text") or "", parse_constant=_no_number))
-        except _NOT_OURS as error:
-            _say_foreign(error)
-            return
-        with self._lock:
-            client = self._client
-            if client is None:
-                self._early.append((window, message))
-        if client is not None:
-            _pass_on(client, window, message)
 
-
-def _pass_on(client: Client, window: Window, message: dict[str, Any]) -> None:
+def _pass_on(client: Client, window: Window, event: Any) -> None:
+    """Pass a window's message on, or report that it is invalid."""
+    if event["type"] == "websocket.disconnect":
+        raise WebSocketDisconnect(event.get("code", 1000))
     try:
-        client.received(window, message)
+        client.received(window, dict(json.loads(event.get("text") or "", parse_constant=_no_number)))
     except _NOT_OURS as error:
-        _say_foreign(error)
-
-
-def _say_foreign(error: Exception) -> None:
-    # without the error's text, which may quote the message
-    found = f"one that is not ({type(error).__name__})"
-    sys.stderr.write(f"splatgraft: expected a message of the editor's own page, found {found}\n")
+        # without the error's text, which may quote the message
+        found = f"one that is not ({type(error).__name__})"
+        sys.stderr.write(f"splatgraft: expected a message of the editor's own page, found {found}\n")
 
 
 class _Guard:
@@ -297,20 +275,10 @@ class _Guard:
 
         async def guarded(message: Any) -> None:
             if message["type"] == "http.response.start":
-                found = {name.lower() for name, _ in message["headers"]}
-                # against frames of other sites (clickjacking), and against leaks of the token in the address
-                extra = {
-                    "X-Frame-Options": "DENY",
-                    "Referrer-Policy": "no-referrer",
-                    "X-Content-Type-Options": "nosniff",
-                }
-                if not scope["path"].startswith(
-                    f"/{FILES_PREFIX}"
-                ):  # reports and exported pages hold scripts of their own
-                    extra["Content-Security-Policy"] = _POLICY
-                message["headers"] += [
-                    (k.encode(), v.encode()) for k, v in extra.items() if k.lower().encode() not in found
-                ]
+                # reports and exported pages hold scripts of their own
+                is_file = scope["path"].startswith(f"/{FILES_PREFIX}")
+                extra = _HEADERS if is_file else _HEADERS | {"Content-Security-Policy": _POLICY}
+                message["headers"] += [(name.encode(), value.encode()) for name, value in extra.items()]
             await send(message)
 
         await self._app(scope, receive, guarded)

@@ -40,7 +40,6 @@ class Session:
         if files is None:
             raise ValueError(f"{project.file}: expected a project, found none")
         self.project = project
-        self.files: ProjectFiles = files
         self.scenes = SceneCache(files)
         self.pictures = Pictures(self.scenes)
         self.jobs = Jobs(files.root / EDITOR_FOLDER)
@@ -56,6 +55,11 @@ class Session:
         self._composed: tuple[int, tuple[ObjectPlacement, ...]] = (0, ())
         self._lock = threading.RLock()
         self.save_again()
+
+    @property
+    def files(self) -> ProjectFiles:
+        """Paths and options of the project."""
+        return self.scenes.files
 
     def save_again(self) -> bool:
         """Try to save the state and the history; return whether the disk had room."""
@@ -104,7 +108,7 @@ class Session:
                 return False
             state, files = read_state(self.files.file), self.project.files()
             self.state, self._stamps = state, stamps
-            self._use_files(files)
+            self.scenes.files = files or self.files
             name = self._store.save(self.state)
             if name != self.history.present:
                 self._save_history(self.history.pushed(name))
@@ -116,7 +120,7 @@ class Session:
             self._refuse_outside_changes()
             self.project.set_view(side, views)
             self._stamps = stamps_of(self.files.file)
-            self._use_files(self.project.files())
+            self.scenes.files = self.project.files() or self.files
 
     def _step(self, move: Callable[[History], History]) -> bool:
         with self._lock:
@@ -141,10 +145,6 @@ class Session:
     def _save_history(self, history: History) -> None:
         self.history = history
         self._store.save_history(history)
-
-    def _use_files(self, files: ProjectFiles | None) -> None:
-        if files is not None:
-            self.files = self.scenes.files = files
 
     # the selection in the source
 

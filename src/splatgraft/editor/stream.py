@@ -58,12 +58,6 @@ class View:
     scale: float = 0.5
     """Size of moving pictures over the canvas's."""
 
-    def touched(self, *, moving: bool) -> None:
-        """Count a change of the picture's content."""
-        self.version += 1
-        if moving:
-            self.moved_at = time.monotonic()
-
     @property
     def canvas(self) -> tuple[int, int]:
         """Width and height of the full picture, pixels."""
@@ -104,7 +98,8 @@ class Stream:
         """Redraw one window, or all."""
         with self._wake:
             for one in self.views if view is None else [view]:
-                one.touched(moving=moving)
+                one.version += 1
+                one.moved_at = time.monotonic() if moving else one.moved_at
             self._wake.notify_all()
 
     def is_at_rest(self, seconds: float) -> bool:
@@ -177,15 +172,14 @@ class Stream:
         seconds = time.monotonic() - start
         if scale < 1.0 or seconds < _BUDGET_SECONDS:
             # half of the time does not depend on the size
-            view.scale = float(
-                np.clip(view.scale * np.clip((_BUDGET_SECONDS / seconds) ** 0.5, 0.7, 1.2), _SMALLEST, 1.0)
-            )
+            factor = np.clip((_BUDGET_SECONDS / seconds) ** 0.5, 0.7, 1.2)
+            view.scale = float(np.clip(view.scale * factor, _SMALLEST, 1.0))
         with self._wake:
             view.sent += 1
             view.sent_at = time.monotonic()
             view.drawn = (version, scale)
             self._wake.notify_all()
-        head = {"n": view.sent, "full": scale == 1.0, "split": view.split, "seconds": round(seconds, 4), **over}
+        head = {"n": view.sent, "full": scale == 1.0, "split": view.split, **over}
         packed = json.dumps(head).encode()
         view.window.send("picture", len(packed).to_bytes(4, "little") + packed + content)
 
