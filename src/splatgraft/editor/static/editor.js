@@ -108,6 +108,7 @@ function showPanel(found) {
   $("status").className = found.bad ? "bad" : "";
   $("undo").disabled = !found.undo || !editing;
   $("redo").disabled = !found.redo || !editing;
+  $("steps").disabled = !editing;
   const step = found.steps.find(([, mark]) => mark === "●");
   fill($("steps"), found.steps, ([name], old) => {
     const button = old || element("button", { onclick: () => send("step", { to: button.dataset.step }) });
@@ -116,19 +117,19 @@ function showPanel(found) {
   }, (button, [name, mark]) => {
     button.textContent = mark && mark !== "●" ? `${mark} ${name}` : name;
     button.setAttribute("aria-current", step && step[0] === name ? "step" : "false");
-    button.disabled = !editing;
   });
   for (const [place, isMore] of [[$("controls"), false], [$("rest"), true]]) {
     const controls = found.controls.filter((one) => Boolean(one.more) === isMore);
-    fill(place, controls, makeControl, updateControl);
-    for (const input of place.querySelectorAll("input, select, button")) if (!editing) input.disabled = true;
+    fill(place, controls, (one) => Object.assign(KINDS[one.kind].make(one), { title: one.hint || "" }), (made, one) => {
+      made.dataset.id = one.id;
+      KINDS[one.kind].update?.(made, one);
+    });
+    place.disabled = !editing;
   }
   $("more").hidden = !found.controls.some((one) => one.more);
   showTools(found.tools || []);
   showJob(found.job);
-  if (found.offer && (offered === null ? false : found.offer.n > offered)) {
-    element("a", { href: found.offer.url, download: found.offer.name }).click();
-  }
+  if (found.offer && offered !== null && found.offer.n > offered) element("a", { href: found.offer.url, download: found.offer.name }).click();
   offered = found.offer ? found.offer.n : 0;
   document.body.dataset.step = step ? step[0] : "";
   drawOver();
@@ -151,42 +152,80 @@ function fill(place, items, make, update) {
     }
     old.delete(key);
     if (place.children[i] !== child) place.insertBefore(child, place.children[i] || null);
-    update(child, item);
+    update?.(child, item);
   });
   for (const child of old.values()) child.remove();
 }
 
-const MAKERS = {
-  note: () => element("p"),
-  button: (one) => element("div", { className: "wide" }, element("button", { onclick: () => send("do", { id: one.id }) })),
-  buttons: () => element("div", { className: "group wide" }),
-  check: (one) => row(one, element("input", { type: "checkbox", onchange: (e) => send("do", { id: one.id, value: e.target.checked }) })),
-  choice: (one) => row(one, element("select", { onchange: (e) => { send("do", { id: one.id, value: e.target.value }); e.target.blur(); } })),
-  text: makeText,
-  numbers: (one) => row(one, element("div", { className: "numbers" })),
-  slider: makeSlider,
-  rows: () => element("div", { className: "rows" }),
-  upload: makeUpload,
-  drawing: makeDrawing,
-  progress: () => element("progress", { max: 1 }),
-  links: () => element("div"),
+const act = (one, value) => send("do", { id: one.id, value });
+
+// kinds of controls: `make` a control once, and `update` it whenever it may have changed
+const KINDS = {
+  note: {
+    make: () => element("p"),
+    update: (made, one) => Object.assign(made, { textContent: one.text, className: `note ${one.bad ? "bad" : ""} ${one.faint ? "faint" : ""}` }),
+  },
+  button: {
+    make: (one) => element("div", { className: "wide" }, element("button", { onclick: () => act(one) })),
+    update: (made, one) => Object.assign(made.firstChild, { textContent: one.label, className: one.main ? "main" : "", disabled: Boolean(one.disabled) }),
+  },
+  buttons: { make: () => element("div", { className: "group wide" }), update: updateButtons },
+  rows: { make: () => element("div", { className: "rows" }), update: updateButtons },
+  check: {
+    make: (one) => row(one, element("input", { type: "checkbox", onchange: (e) => act(one, e.target.checked) })),
+    update: (made, one) => { made.querySelector("input").checked = Boolean(one.value); },
+  },
+  choice: {
+    make: (one) => row(one, element("select", { onchange: (e) => { act(one, e.target.value); e.target.blur(); } })),
+    update: (made, one) => {
+      const input = made.querySelector("select");
+      if (one.options.join("\n") !== [...input.options].map((o) => o.value).join("\n")) input.replaceChildren(...one.options.map((o) => element("option", { value: o, textContent: o })));
+      input.value = one.value;
+    },
+  },
+  text: {
+    make: makeText,
+    update: (made, one) => { const input = made.querySelector("input"); if (document.activeElement !== input) input.value = one.value || ""; },
+  },
+  numbers: { make: (one) => row(one, element("div", { className: "numbers" })), update: (made, one) => updateNumbers(made.querySelector(".numbers"), one) },
+  slider: {
+    make: makeSlider,
+    update: (made, one) => {
+      const input = made.querySelector("input"), value = one.value || 0;
+      Object.assign(input, { min: one.min, max: one.max, step: one.step });
+      if (sliding === one.id) return;
+      input.value = value;
+      made.querySelector(".numbers > span").textContent = value;
+    },
+  },
+  upload: { make: makeUpload },
+  drawing: {
+    make: makeDrawing,
+    update: (made, one) => { if (!made.dataset.busy && made.dataset.svg !== one.svg) { made.innerHTML = one.svg; made.dataset.svg = one.svg; } },
+  },
+  progress: { make: () => element("progress", { max: 1 }), update: (made, one) => { made.value = one.value || 0; } },
+  links: { make: () => element("div"), update: (made, one) => made.replaceChildren(...one.options.map(linkLine)) },
 };
 
 function row(one, ...parts) {
   return element("label", { className: "control" }, element("span", { textContent: one.label }), ...parts);
 }
 
-function makeControl(one) {
-  const made = MAKERS[one.kind](one);
-  made.dataset.id = one.id;
-  return made;
+function updateButtons(made, one) {
+  fill(made, one.options.map((name) => [name]), ([name]) => element("button", { textContent: name, onclick: () => act(one, name) }));
+}
+
+function linkLine([name, remark, opens, download]) {
+  const line = element("p", { className: "note" }, `${name}${remark ? `, ${remark}` : ""} `);
+  if (opens) line.append(element("a", { href: opens, target: "_blank", rel: "noopener", textContent: "open" }), " ");
+  if (download) line.append(element("a", { href: download, download: "", textContent: "download" }));
+  return line;
 }
 
 function makeText(one) {
-  const input = element("input", { type: "text", spellcheck: false, onchange: () => send("do", { id: one.id, value: input.value }) });
-  input.onkeydown = (event) => { if (event.key === "Enter") input.blur(); };
+  const input = element("input", { type: "text", spellcheck: false, onchange: () => act(one, input.value) });
   const parts = element("div", { className: "numbers" }, input);
-  if (one.browse) parts.append(element("button", { textContent: "…", title: "Choose a folder", onclick: (e) => { e.preventDefault(); send("do", { id: `browse_${one.id}` }); } }));
+  if (one.browse) parts.append(element("button", { textContent: "…", title: "Choose a folder", onclick: (e) => { e.preventDefault(); act({ id: `browse_${one.id}` }); } }));
   return row(one, parts);
 }
 
@@ -197,7 +236,7 @@ function makeSlider(one) {
     sliding = one.id;
     send("live", { id: one.id, value: Number(input.value) });
   };
-  input.onchange = () => { sliding = null; send("do", { id: one.id, value: Number(input.value) }); input.blur(); };
+  input.onchange = () => { sliding = null; act(one, Number(input.value)); input.blur(); };
   return row(one, element("div", { className: "numbers" }, input, shown));
 }
 
@@ -247,52 +286,11 @@ function makeDrawing(one) {
   };
   made.onpointerup = made.onpointercancel = (event) => {
     if (dot === null) return;
-    send("do", { id: one.id, value: [dot, ...at(event), true] });
+    act(one, [dot, ...at(event), true]);
     dot = null;
     delete made.dataset.busy;
   };
   return made;
-}
-
-function updateControl(made, one) {
-  const input = made.querySelector("input, select"), isFocused = input && document.activeElement === input;
-  made.title = one.hint || "";
-  if (one.kind === "note") {
-    made.textContent = one.text;
-    made.className = `note ${one.bad ? "bad" : ""} ${one.faint ? "faint" : ""}`;
-  } else if (one.kind === "button") {
-    Object.assign(made.firstChild, { textContent: one.label, className: one.main ? "main" : "", disabled: Boolean(one.disabled) });
-  } else if (one.kind === "buttons" || one.kind === "rows") {
-    fill(made, one.options.map((name) => [name]), ([name]) => element("button", { textContent: name, onclick: () => send("do", { id: one.id, value: name }) }), (button) => { button.disabled = false; });
-  } else if (one.kind === "check") {
-    Object.assign(input, { checked: Boolean(one.value), disabled: false });
-  } else if (one.kind === "choice") {
-    const options = one.options.map(String);
-    if (options.join("\n") !== [...input.options].map((o) => o.value).join("\n")) input.replaceChildren(...options.map((o) => element("option", { value: o, textContent: o })));
-    Object.assign(input, { value: one.value, disabled: false });
-  } else if (one.kind === "text") {
-    if (!isFocused) input.value = one.value || "";
-    for (const part of made.querySelectorAll("input, button")) part.disabled = false;
-  } else if (one.kind === "numbers") {
-    updateNumbers(made.querySelector(".numbers"), one);
-  } else if (one.kind === "slider") {
-    Object.assign(input, { min: one.min, max: one.max, step: one.step, disabled: false });
-    if (sliding !== one.id) {
-      input.value = one.value || 0;
-      made.querySelector(".numbers > span").textContent = one.value || 0;
-    }
-  } else if (one.kind === "drawing") {
-    if (!made.dataset.busy && made.dataset.svg !== one.svg) { made.innerHTML = one.svg; made.dataset.svg = one.svg; }
-  } else if (one.kind === "progress") {
-    made.value = one.value || 0;
-  } else if (one.kind === "links") {
-    made.replaceChildren(...one.options.map(([name, remark, opens, download]) => {
-      const line = element("p", { className: "note" }, `${name}${remark ? `, ${remark}` : ""} `);
-      if (opens) line.append(element("a", { href: opens, target: "_blank", rel: "noopener", textContent: "open" }), " ");
-      if (download) line.append(element("a", { href: download, download: "", textContent: "download" }));
-      return line;
-    }));
-  }
 }
 
 function updateNumbers(place, one) {
@@ -301,16 +299,14 @@ function updateNumbers(place, one) {
     const input = element("input", { type: "number", step: one.step });
     input.onchange = () => {
       const values = [...place.children].map((field, i) => (field === input ? (field.value === "" ? NaN : Number(field.value)) : place.values[i]));
-      if (values.every(Number.isFinite)) send("do", { id: place.closest(".control").dataset.id, value: values });
+      if (values.every(Number.isFinite)) act(one, values);
       else updateNumbers(place, { ...one, value: place.values }); // an emptied field shows its number again
     };
-    input.onkeydown = (event) => { if (event.key === "Enter") input.blur(); };
     input.onblur = () => setTimeout(() => updateNumbers(place, { ...one, value: place.values }));
     place.append(input);
   }
   place.values = one.value;
   [...place.children].forEach((input, i) => {
-    input.disabled = !panel.editing;
     if (document.activeElement !== input) input.value = shown(one.value[i]);
   });
 }
@@ -340,6 +336,7 @@ function showJob(job) {
 
 // the pointer on the view
 
+const plane = document.createElement("canvas").getContext("2d"); // for its geometry alone
 let hoverAt = -1, waiting = null, pointers = new Map();
 function throttled(work) {
   const isFirst = !waiting;
@@ -350,19 +347,11 @@ const at = (event) => {
   const box = view.getBoundingClientRect();
   return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
 };
-function isInside([x, y], hull) {
-  let inside = false;
-  for (let i = 0, j = hull.length - 1; i < hull.length; j = i++) {
-    const [[a, b], [c, d]] = [hull[i], hull[j]];
-    if (b > y !== d > y && x < ((c - a) * (y - b)) / (d - b) + a) inside = !inside;
-  }
-  return inside;
-}
 function under(place) {
   const [w, h] = [view.clientWidth, view.clientHeight];
   const dot = (head.dots || []).findLast((one) => one.id && Math.hypot((one.at[0] - place[0]) * w, (one.at[1] - place[1]) * h) < 14);
   if (dot) return dot.id;
-  const index = (head.hulls || []).findLastIndex((hull) => isInside(place, hull));
+  const index = (head.hulls || []).findLastIndex((hull) => plane.isPointInPath(new Path2D(`M${hull.join("L")}Z`), ...place));
   return index < 0 ? "" : `object:${index}`;
 }
 
@@ -449,7 +438,10 @@ divider.addEventListener("dblclick", () => { split = split ? 0 : 0.5; sendSplit(
 const isTyping = () => /^(INPUT|TEXTAREA|SELECT)$/.test((document.activeElement || {}).tagName || "") && document.activeElement.type !== "range";
 const SENT = new Set(["f", "home", "g", "b", "delete", "backspace", "escape", "arrowleft", "arrowright", "arrowup", "arrowdown", "ctrl+z", "ctrl+shift+z", "ctrl+d", "shift+s"]);
 addEventListener("keydown", (event) => {
-  if (isTyping()) return;
+  if (isTyping()) {
+    if (event.key === "Enter" && /^(text|number)$/.test(event.target.type)) event.target.blur();
+    return;
+  }
   const key = (event.ctrlKey || event.metaKey ? "ctrl+" : "") + (event.shiftKey ? "shift+" : "") + event.key.toLowerCase();
   const tool = (panel.tools || []).find(([, , letter]) => letter.toLowerCase() === key);
   if (key === "tab" || (key === " " && document.activeElement === document.body)) {
