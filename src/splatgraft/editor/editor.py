@@ -32,13 +32,13 @@ from splatgraft.editor.project import Project
 from splatgraft.editor.result_panels import RunPanel, SharePanel
 from splatgraft.editor.select_panel import SelectPanel
 from splatgraft.editor.server import Server, Window
-from splatgraft.editor.session import Session, disk_full
+from splatgraft.editor.session import Session
 from splatgraft.editor.sharing import served_file, written_exports
 from splatgraft.editor.state import EditState
 from splatgraft.editor.state_files import Stamps, stamps_of
 from splatgraft.editor.stream import Stream, View
 from splatgraft.editor.worker import LatestOnlyWorker
-from splatgraft.runtime.files import os_error_line
+from splatgraft.runtime.files import is_disk_full, os_error_line
 from splatgraft.runtime.memo import Memo
 
 KINDS: dict[str, Kind] = {
@@ -135,7 +135,7 @@ class Editor:
         for view in self.stream.views:
             view.orbits.clear()
         try:
-            if self.project.files() is not None:
+            if self.project.file.is_file():
                 self.session = Session(self.project)
                 self._light = LightProcess(self.project, self._lit, self._failed)
         except (ValueError, OSError) as error:
@@ -544,9 +544,9 @@ class Editor:
         try:
             yield
         except (ValueError, OSError) as error:
-            self.is_unsaved = self.is_unsaved or disk_full(error)
-            line = os_error_line(error) if isinstance(error, OSError) else str(error)
-            self.say(_FULL_DISK if disk_full(error) else line, bad=True)
+            is_full, line = is_disk_full(error), os_error_line(error) if isinstance(error, OSError) else str(error)
+            self.is_unsaved = self.is_unsaved or is_full
+            self.say(_FULL_DISK if is_full else line, bad=True)
         except Exception as error:  # a programming error must be visible and must not end the page
             traceback.print_exc()
             self.say(f"{type(error).__name__}: {error} (traceback in the terminal)", bad=True)

@@ -14,7 +14,6 @@ from splatgraft.core.cameras import Cameras
 from splatgraft.editor.drag import Corner, on_canvas
 from splatgraft.editor.form import Form
 from splatgraft.editor.panel import Panel, Pointer
-from splatgraft.editor.picking import Ray, first_surface_hit
 from splatgraft.editor.sky_dome import SkyDome, color_of
 from splatgraft.editor.state import check_state
 from splatgraft.editor.stream import View
@@ -247,15 +246,9 @@ class LightPanel(Panel):
             self.editor.say("click what casts a shadow in the scene, such as the corner of a table")
 
     def _add_point(self, view: View, pointer: Pointer) -> None:
-        session, ray = self.session, Ray.through(pointer.place, self.camera(view))
-        state, files = session.placed_state(), session.files
-        scene = session.scenes.gaussians(files.target_scene)
-        if state.erased is not None:
-            scene = scene.select(~state.erased)
-        hit = first_surface_hit(scene, ray.origin, ray.direction)
-        if hit is None:
-            raise ValueError("Click on a surface: there is none under the pointer.")
-        x, y, z = hit.tolist()
+        session, state = self.session, self.session.placed_state()
+        scene = self.pictures.lit.place(state)
+        x, y, z = self.surface_under(pointer, view, scene)[0].tolist()
         points = (*self._kept(), (x, y, z))
         if len(points) % 2:
             self._points, self._set_light = points, session.state.light
@@ -264,7 +257,8 @@ class LightPanel(Panel):
         self._points, light = points[:-2], self._light()
         if light is None:
             raise ValueError(self._missing())
-        captured = CapturedScene(scene, session.scenes.cameras(files.target_cameras), session.scenes.target_clock())
+        cameras = session.scenes.cameras(session.files.target_cameras)
+        captured = CapturedScene(scene, cameras, session.scenes.target_clock())
         sun = set_sun(points, captured)
         session.change(replace(state, light=with_sun(light, sun)))
         self._points, self._set_light = points, session.state.light

@@ -165,7 +165,7 @@ class _Computing:
             if self._drafts.wait_idle(_SETTLE_SECONDS):
                 self._relighting.prepare_drafts(state)
             return
-        if self._scenes.files.transfers_light and not self._relighting.is_relit(state):
+        if not self._relighting.is_relit(state):
             draft = self._relighting.draft(state)
             none = draft.relit.gaussians.select(torch.zeros(0, dtype=torch.int64))
             sent = replace(_without_evidence(draft.relit), gaussians=none, objects=())

@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
+from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.drag import Corner, on_canvas
 from splatgraft.editor.form import Form
 from splatgraft.editor.jobs import JobState
+from splatgraft.editor.picking import Ray, first_surface_hit
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.session import Session
 from splatgraft.editor.stream import View
@@ -75,6 +78,7 @@ class Panel:
     def __init__(self, editor: Editor) -> None:
         """Attach to an editor."""
         self.editor = editor
+        self._held_box: BoxDrag | None = None
 
     @property
     def session(self) -> Session:
@@ -102,6 +106,24 @@ class Panel:
 
     def leave(self) -> None:
         """Clean up when the step is left."""
+        self._held_box = None
+
+    def dragged_box(self, view: View, pointer: Pointer, box: Box | None) -> Box | None:
+        """Return the box whose corner the pointer drags; None if it drags none."""
+        held = self._held_box
+        if pointer.what == "down" and box is not None:
+            self._held_box = BoxDrag(box, pointer.on, self.camera(view))
+        elif pointer.what != "move":
+            self._held_box = None
+        return None if held is None or pointer.what in ("down", "cancel") else held.at(pointer.place)
+
+    def surface_under(self, pointer: Pointer, view: View, scene: Gaussians) -> tuple[Float[Tensor, 3], Ray]:
+        """Return the point of a scene's surface under the pointer, and the ray; raise ValueError if there is none."""
+        ray = Ray.through(pointer.place, self.camera(view))
+        hit = first_surface_hit(scene, ray.origin, ray.direction)
+        if hit is None:
+            raise ValueError("Click on a surface: there is none under the pointer.")
+        return hit, ray
 
     def close(self) -> None:
         """End all threads."""

@@ -5,8 +5,9 @@ An object that was moved since then keeps its last lit colours, over a contact s
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -55,8 +56,9 @@ class _LitState:
     state: EditState
     stage: str
     """Stage of the light: `final`, `refined` or `draft`; `file`: the step's result, without layers."""
-    relit: Relit | None
-    baked: tuple[Gaussians, Bool[Tensor, "b"]] | None = None
+    bake: Callable[[LayerWeights], tuple[Gaussians, Bool[Tensor, "b"]]]
+    """The scene by the weights of its layers, with flags of the objects."""
+    relit: Relit | None = None
 
     def fits(self, state: EditState) -> bool:
         """Return whether a state has the same light and placements."""
@@ -96,7 +98,7 @@ class LitScenes:
                 return
             layers = lit.layers
             relit = layers.of_all(self._scenes.composite(state)) if isinstance(layers, Draft) else layers
-            self._now = _LitState(state, lit.stage, relit)
+            self._now = _LitState(state, lit.stage, relit.bake, relit)
 
     def adopt(self, state: EditState) -> None:
         """Read the result of the step `relight`, which is up to date for a state."""
@@ -104,7 +106,7 @@ class LitScenes:
         flags = read_flags(path.with_name(IS_OBJECT_FILE))
         scene = self._scenes.gaussians(path)
         with self._lock:
-            self._now = _LitState(state, "file", None, (scene, flags))
+            self._now = _LitState(state, "file", lambda weights: (scene, flags))
 
     def stage(self, state: EditState) -> str:
         """Return the stage of a state's light; empty if it is not known."""
@@ -151,23 +153,18 @@ class LitScenes:
             self._now = None
 
     def _baked(self, lit: _LitState, weights: LayerWeights) -> tuple[Gaussians, Bool[Tensor, "b"]]:
-        relit = lit.relit
-        if relit is None:
-            assert lit.baked is not None
-            return lit.baked
-        return self._memo.get("baked", (relit, weights), lambda: relit.bake(weights))
+        return self._memo.get("baked", (lit, weights), lambda: lit.bake(weights))
 
     def _moved(self, lit: _LitState | None, state: EditState) -> Gaussians:
         """Return the scene with the last lit objects moved to new placements."""
         objects, place = list(state.objects or ()), self.place(state)
-        parts = self._lit_objects(lit, state.weights) if lit is not None else {}
+        parts = self._lit_objects(lit, state.weights) if lit is not None else []
         moved, feet = [], []
         for index, item in enumerate(objects):
             path, move = self._scenes.object_path(item), item.target_from_object
-            own = [number for number, (known, _, _) in parts.items() if known == path]
+            own = [number for number, (known, _, _) in enumerate(parts) if known == path]
             if own:
-                number = index if index in own else own[0]
-                _, before, gaussians = parts[number]
+                _, before, gaussians = parts[index if index in own else own[0]]
                 moved.append(_moved_by(move @ before.inverse(), gaussians))
             else:
                 moved.append(move.gaussians(self._scenes.gaussians(path)))
@@ -176,19 +173,17 @@ class LitScenes:
             self._joined = _JoinedScene(place, moved)
         return self._joined.at(moved, feet)
 
-    def _lit_objects(self, lit: _LitState, weights: LayerWeights) -> dict[int, tuple[object, Similarity, Gaussians]]:
-        """Return the lit objects in the target's frame, with file and placement, by number."""
+    def _lit_objects(self, lit: _LitState, weights: LayerWeights) -> list[tuple[Path, Similarity, Gaussians]]:
+        """Return the lit objects in the target's frame, with file and placement."""
 
-        def make() -> dict[int, tuple[object, Similarity, Gaussians]]:
-            scene, is_object = self._baked(lit, weights)
-            rows, found = is_object.nonzero()[:, 0], {}
-            items = lit.state.objects or ()
-            counts = [self._scenes.gaussians(self._scenes.object_path(item)).count for item in items]
+        def make() -> list[tuple[Path, Similarity, Gaussians]]:
+            (scene, is_object), items = self._baked(lit, weights), lit.state.objects or ()
+            rows, paths = is_object.nonzero()[:, 0], [self._scenes.object_path(item) for item in items]
+            counts = [self._scenes.gaussians(path).count for path in paths]
             if len(rows) != sum(counts):
-                return {}  # the files of the objects have changed
-            for index, (item, part) in enumerate(zip(items, rows.split(counts), strict=True)):
-                found[index] = (self._scenes.object_path(item), item.target_from_object, scene.select(part))
-            return found
+                return []  # the files of the objects have changed
+            parts = zip(paths, items, rows.split(counts), strict=True)
+            return [(path, item.target_from_object, scene.select(part)) for path, item, part in parts]
 
         return self._memo.get("lit objects", (lit, weights), make)
 

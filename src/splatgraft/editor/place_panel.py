@@ -16,7 +16,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.drag import Drag, DragMode, outline
 from splatgraft.editor.form import Form
-from splatgraft.editor.panel import CORNERS, BoxDrag, Panel, Pointer, box_over
+from splatgraft.editor.panel import CORNERS, Panel, Pointer, box_over
 from splatgraft.editor.pictures import same_places
 from splatgraft.editor.placement import (
     ObjectSize,
@@ -60,12 +60,12 @@ class PlacePanel(Panel):
         self._chosen, self._snaps, self._path, self._known_cm = 0, False, "", 0.0
         self._drag: tuple[int, DragMode, tuple[float, float], Drag] | None = None
         self._box: Box | None = None
-        self._held_box: BoxDrag | None = None
         self._solid = Memo()
 
     def leave(self) -> None:
         """End drags and remove the box."""
-        self._drag = self._box = self._held_box = None
+        super().leave()
+        self._drag = self._box = None
 
     def tools(self) -> dict[str, Any]:
         """Return the drag modes of an object."""
@@ -299,7 +299,8 @@ class PlacePanel(Panel):
     def pointer(self, view: View, pointer: Pointer) -> None:
         """Drag an object, or a corner of the box."""
         if pointer.on in CORNERS:
-            self._drag_box(view, pointer)
+            self._box = self.dragged_box(view, pointer, self._box) or self._box
+            self.editor.stream.touch(moving=True)
         elif pointer.what == "down" and pointer.on.startswith("object:"):
             self._grab(view, pointer)
         elif self._drag is not None:
@@ -339,16 +340,6 @@ class PlacePanel(Panel):
             self.editor.show_live(None)
         else:
             self.editor.show_live(edited)
-
-    def _drag_box(self, view: View, pointer: Pointer) -> None:
-        if pointer.what == "down" and self._box is not None:
-            self._held_box = BoxDrag(self._box, pointer.on, self.camera(view))
-        elif self._held_box is not None:
-            if pointer.what != "cancel":
-                self._box = self._held_box.at(pointer.place)
-            if pointer.what != "move":
-                self._held_box = None
-            self.editor.stream.touch(moving=True)
 
     # erasing
 

@@ -3,6 +3,7 @@
 import json
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from splatgraft.editor.state import EditState
 from splatgraft.folders.clock_sun import clock_sun_path, read_clock_sun
 from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.project.gaussian_flags import read_flags
-from splatgraft.project.placement import ObjectPlacement
+from splatgraft.project.placement import ObjectPlacement, read_placement
 from splatgraft.relighting import SourceScene
 from splatgraft.runtime.memo import Memo
 
@@ -67,6 +68,16 @@ class SceneCache:
         found = self._read("selection", self.files.selection, read_flags)
         # flags of another reconstruction do not apply
         return found if len(found) == self.gaussians(self.files.source_scene).count else None
+
+    def composed_objects(self) -> tuple[ObjectPlacement, ...]:
+        """Read the objects as `compose` placed them; the project's own object gets no path."""
+
+        def read(path: Path) -> tuple[ObjectPlacement, ...]:
+            own, items = self.files.object.resolve(), read_placement(path).objects
+            is_own = [item.object_path is not None and item.object_path.resolve() == own for item in items]
+            return tuple(replace(x, object_path=None) if flag else x for x, flag in zip(items, is_own, strict=True))
+
+        return self._read("placement", self.files.placement, read)
 
     def object_path(self, item: ObjectPlacement) -> Path:
         """Return the file of a placed object."""

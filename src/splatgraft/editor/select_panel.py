@@ -12,9 +12,9 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.form import Form
-from splatgraft.editor.panel import CORNERS, BoxDrag, Panel, Pointer, box_over
+from splatgraft.editor.panel import CORNERS, Panel, Pointer, box_over
 from splatgraft.editor.photo_view import PhotoView, prompt_of, seen_best, with_click
-from splatgraft.editor.picking import Ray, Rectangle, brush_selection, first_surface_hit, in_rectangle, interpolate_rays
+from splatgraft.editor.picking import Ray, Rectangle, brush_selection, in_rectangle, interpolate_rays
 from splatgraft.editor.state import EditState
 from splatgraft.editor.stream import View
 from splatgraft.editor.worker import LatestOnlyWorker
@@ -46,7 +46,6 @@ class SelectPanel(Panel):
         self._brush_size = 0.1
         self._stroke: list[Ray] = []
         self._touched: Tensor | None = None
-        self._held_box: BoxDrag | None = None
         self._outlines: tuple[EditState | None, dict[int, Any]] = (None, {})
         """Outlines by the clicks of one state, for each photo."""
         self._finder = LatestOnlyWorker(self._find_outline, lambda error: editor.say(str(error), bad=True))
@@ -62,6 +61,7 @@ class SelectPanel(Panel):
 
     def leave(self) -> None:
         """Switch the brush off."""
+        super().leave()
         self._uses_brush, self._stroke, self._touched = False, [], None
 
     def build(self, form: Form) -> None:
@@ -177,7 +177,9 @@ class SelectPanel(Panel):
             part = Rectangle((min(x, u), min(y, v)), (max(x, u), max(y, v)))
             self._correct(in_rectangle(self._scene().means, camera, part), add=self._adds != pointer.alt)
         elif pointer.on in CORNERS:
-            self._drag_box(view, pointer)
+            found = self.dragged_box(view, pointer, self.session.box())
+            if found is not None and pointer.what == "up":
+                self._set_box(found)
         elif self._uses_brush:
             self._paint(view, pointer)
         elif pointer.what == "click":
@@ -193,10 +195,7 @@ class SelectPanel(Panel):
             if pixel is None:
                 raise ValueError("Click in the photo, not beside it.")
         else:
-            ray = Ray.through(pointer.place, self.camera(view))
-            hit = first_surface_hit(self._scene(), ray.origin, ray.direction)
-            if hit is None:
-                raise ValueError("Click on a surface: there is none under the pointer.")
+            hit, ray = self.surface_under(pointer, view, self._scene())
             photo, pixel = seen_best(hit, ray.direction, cameras)
             size = pictures.source_photo(photo)[1]
             scale = size[0] / cameras[photo].width
@@ -212,15 +211,6 @@ class SelectPanel(Panel):
         clicks = "1 click" if count == 1 else f"{count} clicks"
         others = "" if takes else "; outlines are found by clicks now"
         self.editor.say(f"{clicks} in {len(prompts or {})} of the photos{others}. {self._again('them')}")
-
-    def _drag_box(self, view: View, pointer: Pointer) -> None:
-        box, held = self.session.box(), self._held_box
-        if pointer.what == "down" and box is not None:
-            self._held_box = BoxDrag(box, pointer.on, self.camera(view))
-        elif held is not None and pointer.what != "move":
-            self._held_box = None
-            if pointer.what == "up":
-                self._set_box(held.at(pointer.place))
 
     # the brush
 

@@ -1,6 +1,5 @@
 """An open project: its edits with undo history, saved after every change, and its scenes and job."""
 
-import errno
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +22,8 @@ from splatgraft.editor.state import EditState, check_height_cm, check_state
 from splatgraft.editor.state_files import as_written, read_state, stamps_of, write_state
 from splatgraft.project.layout import EDITOR_FOLDER, Side
 from splatgraft.project.metric_scale import MetricScale, read_scale, write_scale
-from splatgraft.project.placement import ObjectPlacement, read_placement
+from splatgraft.project.placement import ObjectPlacement
+from splatgraft.runtime.files import is_disk_full
 from splatgraft.segmentation import Box, add_correction, apply_corrections
 
 
@@ -52,7 +52,6 @@ class Session:
         saved, now = self._store.read_history(), self._store.name(self.state)
         # a change of the files while no editor was open is one more step
         self.history = History(now) if saved is None else saved if saved.present == now else saved.pushed(now)
-        self._composed: tuple[int, tuple[ObjectPlacement, ...]] = (0, ())
         self._lock = threading.RLock()
         self.save_again()
 
@@ -68,7 +67,7 @@ class Session:
                 self._store.save(self.state)
                 self._store.save_history(self.history)
             except (ValueError, OSError) as error:
-                if not disk_full(error):
+                if not is_disk_full(error):
                     raise
                 self.unsaved = "Disk full: nothing can be saved"
                 return False
@@ -185,18 +184,8 @@ class Session:
         if self.state.objects is not None:
             return self.state.objects
         files = self.files
-        if not all(path.is_file() for path in (files.object, files.target_scene, files.placement)):
-            return ()
-        stamp = files.placement.stat().st_mtime_ns
-        if self._composed[0] != stamp:
-            own = files.object.resolve()
-            # the project's own object is stored without a path
-            items = tuple(
-                replace(item, object_path=None) if item.object_path and item.object_path.resolve() == own else item
-                for item in read_placement(files.placement).objects
-            )
-            self._composed = (stamp, items)
-        return self._composed[1]
+        is_composed = all(path.is_file() for path in (files.object, files.target_scene, files.placement))
+        return self.scenes.composed_objects() if is_composed else ()
 
     def placed_state(self) -> EditState:
         """Return the current state with the objects of `compose` filled in."""
@@ -270,12 +259,3 @@ class Session:
             return None
         words = in_words(name, reason)
         return words if words != reason else f"{name}: {reason}"
-
-
-def disk_full(error: BaseException | None) -> bool:
-    """Return whether an error was caused by a full disk."""
-    while error is not None:
-        if getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT):
-            return True
-        error = error.__cause__ or error.__context__
-    return False

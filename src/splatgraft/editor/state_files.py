@@ -1,46 +1,50 @@
 """The edits in their files: project.toml, placement.json, erased.npy, corrections.npy, prompts.json, light.json."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from splatgraft.editor.state import BoxNumbers, EditState, check_state
+from splatgraft.editor.state import EditState, check_state
 from splatgraft.project.gaussian_flags import read_corrections, write_flags
 from splatgraft.project.layout import ERASED_FILE, LIGHT_FILE, PLACEMENT_FILE
 from splatgraft.project.placement import Placement, read_placement, write_placement
 from splatgraft.project.prompts import read_prompts, write_prompts
 from splatgraft.project.toml_edit import with_keys
-from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
+from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.settings import MAX_TEXT_BYTES, read_toml
+from splatgraft.steps.relight import Relight
+from splatgraft.steps.segment import Segment
+from splatgraft.workflow.flow import read_flow
 
 Stamps = tuple[tuple[int, int] | None, ...]
 """Time and size of each file of the edits; None for a missing file."""
 _CORRECTIONS_FILE, _PROMPTS_FILE = "corrections.npy", "prompts.json"
+_PLAIN_KEYS = ("mask_source", "keep", "box")  # of [segment], fields of the state of the same name
 _KEYS_OF_FILES = {"corrections": "corrections", "prompts": "prompts", "given_light": "light"}
 """Keys of project.toml that name a file, with the field that it holds."""
 
 
 def read_state(project: Path) -> EditState:
     """Read the state from project.toml and the files beside it; raise ValueError, in one line, for an invalid file."""
-    content, folder = read_toml(project), project.parent
-    segment, relight, harmonize = (_table(content, name, project) for name in ("segment", "relight", "harmonize"))
-    placement, file = folder / PLACEMENT_FILE, project
-    given, corrections, prompts = relight.get("given_light"), segment.get("corrections"), segment.get("prompts")
-    values: dict[str, Any] = {}
+    content, steps, file = read_toml(project), read_flow(project).steps, project
+    segment, relight, placement = steps["segment"], steps["relight"], project.parent / PLACEMENT_FILE
+    assert isinstance(segment, Segment)
+    assert isinstance(relight, Relight)
     # a file may hold numbers beyond float's range, a path of the wrong type, or endless nesting
     try:
-        values |= {key: segment[key] for key in ("mask_source", "keep") if key in segment}
-        values |= {"box": _six(segment["box"], project)} if "box" in segment else {}
-        values |= {"weights": _weights(relight, project), "harmonizer": harmonize.get("method")}
-        if corrections is not None:
-            values["corrections"] = read_corrections(folder / corrections)
-        if prompts is not None:
-            values["prompts"] = read_prompts(folder / prompts)
-        if given is not None:
-            values["light"] = _light(folder / given)
+        values: dict[str, Any] = {
+            key: getattr(segment, key) for key in _PLAIN_KEYS if key in content.get("segment", {})
+        }
+        values |= {"weights": relight.weights, "harmonizer": content.get("harmonize", {}).get("method")}
+        if segment.corrections is not None:
+            values["corrections"] = read_corrections(segment.corrections)
+        if segment.prompts is not None:
+            values["prompts"] = read_prompts(segment.prompts)
+        if relight.given_light is not None:
+            _check_size(relight.given_light)
+            values["light"] = relight.given()
         check_state(EditState(**values))
         if placement.is_file():
             file = placement
@@ -50,7 +54,7 @@ def read_state(project: Path) -> EditState:
             check_state(EditState(objects=found.objects))
     except (ValueError, OSError, TypeError, ArithmeticError, RecursionError, MemoryError) as error:
         line = " ".join((str(error) or type(error).__name__).split())
-        raise ValueError(line if str(folder) in line else f"{file}: {line}") from error
+        raise ValueError(line if str(project.parent) in line else f"{file}: {line}") from error
     return EditState(**values)
 
 
@@ -125,36 +129,7 @@ def _keys(state: EditState) -> dict[tuple[str, str], Any]:
     return {(table, key): value for table, keys in tables.items() for key, value in keys.items()}
 
 
-def _table(content: Mapping[str, Any], name: str, project: Path) -> Mapping[str, Any]:
-    table = content.get(name, {})
-    if not isinstance(table, dict):
-        raise ValueError(f"{project}: expected [{name}] to be a table, found {table!r:.60}")
-    return table
-
-
-def _light(path: Path) -> Light:
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a light.json, found no such file")
-    _check_size(path)
-    return light_from_json(path.read_text(encoding="utf-8"), name=str(path))
-
-
-def _weights(relight: Mapping[str, Any], project: Path) -> LayerWeights:
-    given = {f.name: relight[f.name] for f in fields(LayerWeights) if f.name in relight}
-    for name, value in given.items():
-        if not isinstance(value, int | float) or isinstance(value, bool):
-            raise ValueError(f"{project} [relight] {name}: expected a number, found {value!r:.60}")
-    return LayerWeights(**{name: float(value) for name, value in given.items()})
-
-
-def _six(box: Any, project: Path) -> BoxNumbers:
-    if not isinstance(box, list) or len(box) != 6 or not all(isinstance(x, int | float) for x in box):
-        raise ValueError(f"{project} [segment] box: expected six numbers, found {box!r:.60}")
-    a, b, c, d, e, f = (float(x) for x in box)
-    return a, b, c, d, e, f
-
-
 def _check_size(path: Path) -> None:
-    size = path.stat().st_size
+    size = path.stat().st_size if path.is_file() else 0
     if size > MAX_TEXT_BYTES:
         raise ValueError(f"{path}: expected at most {MAX_TEXT_BYTES >> 20} MiB of text, found {size >> 20} MiB")

@@ -124,6 +124,11 @@ def room_on_disk(path: Path, otherwise: str = "") -> Generator[None]:
         raise ValueError(f"{path}: expected room to write it, found {found}{otherwise}") from error
 
 
+def is_disk_full(error: BaseException) -> bool:
+    """Return whether an error, or one of its causes, was that the disk or the user's quota is full."""
+    return any(number in (errno.ENOSPC, errno.EDQUOT) for number in _numbers(error))
+
+
 def os_error_line(error: OSError) -> str:
     """Describe an error of the system: the file, if it names one, and the cause."""
     if error.filename is None or error.strerror is None:
