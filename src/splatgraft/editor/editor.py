@@ -38,6 +38,7 @@ from splatgraft.editor.state import EditState
 from splatgraft.editor.state_files import Stamps, stamps_of
 from splatgraft.editor.stream import Stream, View
 from splatgraft.editor.worker import LatestOnlyWorker
+from splatgraft.project.layout import Side
 from splatgraft.runtime.files import is_disk_full, os_error_line
 from splatgraft.runtime.memo import Memo
 
@@ -109,12 +110,8 @@ class Editor:
         server.attach(self)
         with self.lock:
             self.open_project()
-        self._threads = [
-            threading.Thread(target=work, name=f"splatgraft {name}", daemon=True)
-            for name, work in (("actions", self._act), ("poll", self._poll_loop))
-        ]
-        for thread in self._threads:
-            thread.start()
+        for name, work in (("actions", self._act), ("poll", self._poll_loop)):
+            threading.Thread(target=work, name=f"splatgraft {name}", daemon=True).start()
 
     def close(self) -> None:
         """End all threads and the light process; jobs continue."""
@@ -302,20 +299,15 @@ class Editor:
         return kept
 
     @property
-    def side(self) -> str:
-        """Scene that the step shows, `source` or `target`."""
+    def side(self) -> Side:
+        """Scene that the step shows."""
         return "source" if self.step == "Select" else "target"
 
     def cameras(self) -> Cameras | None:
         """Return the cameras of the shown scene; None if they or the scene do not exist yet."""
         if self.session is None:
             return None
-        files = self.session.files
-        pairs = {
-            "source": (files.source_scene, files.source_cameras),
-            "target": (files.target_scene, files.target_cameras),
-        }
-        scene, path = pairs[self.side]
+        scene, path = self.session.files.scene_and_cameras(self.side)
         return self.session.scenes.cameras(path) if path.is_file() and scene.is_file() else None
 
     def up(self) -> np.ndarray:

@@ -73,11 +73,6 @@ class LightProcess:
     def want(self, state: EditState, wanted: Wanted) -> None:
         """Request the light of a state in place of the last request, unless it was requested already."""
         with self._lock:
-            latest = self._asked.get(self._number)
-            is_same = latest is not None and all(getattr(latest, name) is getattr(state, name) for name in _FIELDS)
-            order = get_args(Wanted)
-            if is_same and self._wanted is not None and order.index(self._wanted) >= order.index(wanted):
-                return
             if self._child is None or self._child.poll() is not None:
                 self._start()
             assert self._child is not None
@@ -86,10 +81,11 @@ class LightProcess:
             changed = {
                 name: getattr(state, name) for name in _FIELDS if self._sent.get(name, self) is not getattr(state, name)
             }
+            order = get_args(Wanted)
+            if not changed and self._wanted is not None and order.index(self._wanted) >= order.index(wanted):
+                return
             self._number, self._wanted = self._number + 1, wanted
-            self._asked = {
-                number: asked for number, asked in self._asked.items() if number > self._number - _REMEMBERED
-            }
+            self._asked.pop(self._number - _REMEMBERED, None)
             self._asked[self._number] = state
             try:
                 _write(self._child.stdin, (self._number, changed, wanted))
@@ -109,7 +105,7 @@ class LightProcess:
             child.wait()
 
     def _start(self) -> None:
-        self._sent, self._asked = {}, {}
+        self._sent, self._asked, self._wanted = {}, {}, None
         out = "" if self._project.out is None else str(self._project.out)
         words = [sys.executable, "-c", _START, str(self._project.file), out]
         # a group of its own is not interrupted by Ctrl-C; in another session its priority would not count (autogroups)

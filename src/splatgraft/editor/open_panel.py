@@ -14,7 +14,7 @@ from splatgraft.editor.session import Session
 from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.folders.input_description import InputDescription, describe_input
 from splatgraft.formats import SCENE_SUFFIXES
-from splatgraft.project.layout import Side
+from splatgraft.project.layout import SIDES, Side
 
 if TYPE_CHECKING:
     from splatgraft.editor.editor import Editor
@@ -29,7 +29,6 @@ _FIELDS = {
     "source_scene": "Scene of the object",
     "target_scene": "Scene of the place",
 }
-_SIDES: tuple[Side, Side] = ("source", "target")
 _VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 _PHOTOS = (".jpg", ".jpeg", ".png", ".heic", ".tif", ".tiff", ".webp")
 _UPS: dict[str, Triple | None] = {
@@ -53,7 +52,7 @@ class OpenPanel(Panel):
         """Start without captures."""
         super().__init__(editor)
         self._paths = dict.fromkeys(_FIELDS, "")
-        self._found: dict[str, InputDescription | None] = dict.fromkeys(_SIDES)
+        self._found: dict[str, InputDescription | None] = dict.fromkeys(SIDES)
         self._browsed: tuple[str, Path] | None = None
         """Field for which a folder of this machine is shown, and that folder."""
         self._looker = LatestOnlyWorker(self._look, lambda error: editor.say(str(error), bad=True))
@@ -80,7 +79,7 @@ class OpenPanel(Panel):
             self._build_folder(form, *self._browsed)
             return
         form.note(_HELP, name="help")
-        for name in _SIDES:
+        for name in SIDES:
             self._add_path(form, name, "A path")
             found = self._found[name]
             if found is not None:
@@ -132,13 +131,13 @@ class OpenPanel(Panel):
 
     def _set(self, name: str, value: str) -> None:
         self._paths[name] = value.strip()
-        if name in _SIDES:
+        if name in SIDES:
             self._found[name] = None
             self._looker.submit(dict(self._paths))
 
     def _look(self, paths: dict[str, str]) -> None:
         """Describe the inputs at the paths."""
-        for name in _SIDES:
+        for name in SIDES:
             self._found[name] = describe_input(parse_path(paths[name])) if paths[name] else None
         self.editor.refresh()
 
@@ -158,23 +157,23 @@ class OpenPanel(Panel):
     def uploaded(self, path: Path, use: str) -> None:
         """Use an uploaded file, or the folder of uploaded photos, as a capture."""
         name = use.removeprefix("upload_")
-        if name in _SIDES and self.editor.session is None:
+        if name in SIDES and self.editor.session is None:
             self._set(name, str(path.parent if path.suffix.lower() in _PHOTOS else path))
 
     # the open project
 
     def _build_open(self, form: Form, session: Session) -> None:
         files = session.files
-        for index, side in enumerate(_SIDES):
+        for index, side in enumerate(SIDES):
             form.note(self._line(session, index), name=f"facts_{side}")
         have_both = files.have_both_scenes
-        why = session.why_stale(*(f"{side}/reconstruct" for side in _SIDES)) if have_both else None
+        why = session.why_stale(*(f"{side}/reconstruct" for side in SIDES)) if have_both else None
         form.note("" if why is None else f"Out of date: {why}", name="stale")
         if not have_both or why is not None:
             title = "Update both scenes" if have_both else _title(session)
             form.button("build", title, lambda: self.editor.run("reconstruct", title), main=not have_both)
         form.more()
-        for index, side in enumerate(_SIDES):
+        for index, side in enumerate(SIDES):
             if files.without_photos[index]:
                 self._build_views(form, side, files.rendered_views[index])
 
@@ -192,9 +191,8 @@ class OpenPanel(Panel):
         form.choice(f"up_{side}", f"Up: {side}", views.up, ups, partial(set_views, "up"))
 
     def _line(self, session: Session, index: int) -> str:
-        files, name = session.files, _FIELDS[_SIDES[index]]
-        scene = (files.source_scene, files.target_scene)[index]
-        cameras = (files.source_cameras, files.target_cameras)[index]
+        files, name = session.files, _FIELDS[SIDES[index]]
+        scene, cameras = files.scene_and_cameras(SIDES[index])
         if not scene.is_file():
             return f"{name}: not built yet"
         text = f"{name}: ready"

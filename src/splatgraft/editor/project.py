@@ -17,6 +17,7 @@ from splatgraft.project.layout import (
     PLACEMENT_FILE,
     SCENE_FILE,
     SELECTION_FILE,
+    SIDES,
     SURROUNDINGS_FILE,
     Side,
 )
@@ -28,7 +29,7 @@ from splatgraft.steps.capture import Capture
 from splatgraft.steps.compose import Compose
 from splatgraft.steps.relight import Relight
 from splatgraft.steps.segment import Segment
-from splatgraft.workflow.flow import Flow, read_flow, reasons
+from splatgraft.workflow.flow import read_flow, reasons
 
 ExportPage = Literal["viewer", "report"]
 """Contents of an exported .html."""
@@ -87,6 +88,12 @@ class ProjectFiles:
     place_options: PlaceOptions
     """Placement options of [compose], for objects without a placement."""
 
+    def scene_and_cameras(self, side: Side) -> tuple[Path, Path]:
+        """Return the reconstruction of a side and its transforms.json."""
+        return (
+            (self.source_scene, self.source_cameras) if side == "source" else (self.target_scene, self.target_cameras)
+        )
+
     @property
     def have_both_scenes(self) -> bool:
         """Whether both reconstructions exist."""
@@ -107,6 +114,11 @@ class Project:
     out: Path | None = None
     """Folder of all results; None: the folder of project.toml."""
 
+    @property
+    def root(self) -> Path:
+        """Folder of all results."""
+        return self.file.parent if self.out is None else self.out
+
     def files(self) -> ProjectFiles | None:
         """Read the project's files; None if project.toml does not exist yet."""
         if not self.file.is_file():
@@ -114,6 +126,9 @@ class Project:
         flow = read_flow(self.file, self.out)
         layout = flow.layout
         segment, compose, relight = (flow.steps[name] for name in ("segment", "compose", "relight"))
+        source, target = (flow.steps[f"{side}/capture"] for side in SIDES)
+        assert isinstance(source, Capture)
+        assert isinstance(target, Capture)
         assert isinstance(segment, Segment)
         assert isinstance(compose, Compose)
         assert isinstance(relight, Relight)
@@ -131,8 +146,8 @@ class Project:
             relit=layout.relit / SCENE_FILE,
             result=layout.result / SCENE_FILE,
             report=layout.report,
-            without_photos=(_has_no_photos(flow, "source"), _has_no_photos(flow, "target")),
-            rendered_views=(_rendered_views(flow, "source"), _rendered_views(flow, "target")),
+            without_photos=(is_scene(source.capture), is_scene(target.capture)),
+            rendered_views=(_rendered_views(source), _rendered_views(target)),
             light_mode=relight.light,
             relight_options=relight.options,
             place_options=compose.options,
@@ -151,7 +166,7 @@ class Project:
             if scene is not None and not scene.is_file():
                 raise ValueError(f"{scene}: expected a trained scene, found no such file")
         Init(folder=self.file.parent, source=captures[0], target=captures[1]).execute(Console())
-        for side, scene in zip(("source", "target"), scenes, strict=True):
+        for side, scene in zip(SIDES, scenes, strict=True):
             if scene is not None:
                 self._set_keys(side, {"scene": relative_name(scene, self.file.parent)})
 
@@ -172,25 +187,15 @@ class Project:
     def export_words(self, to: Path, *, page: ExportPage, layer: Layer) -> tuple[str, ...]:
         """Return the arguments of `splatgraft` that write the result or a part of it in the suffix's format."""
         part = ("--page", page) if page == "report" else () if layer == "all" else ("--layer", layer)
-        return ("export", str(self._root()), "--to", str(to), *part)
+        return ("export", str(self.root), "--to", str(to), *part)
 
     def job_command(self, words: tuple[str, ...], title: str) -> tuple[str, ...]:
         """Return the command line of the child process that runs these arguments as a job."""
-        return (sys.executable, "-m", "splatgraft.editor.job_process", str(self._root() / EDITOR_FOLDER), title, *words)
-
-    def _root(self) -> Path:
-        files = self.files()
-        return self.file.parent if files is None else files.root
+        return (sys.executable, "-m", "splatgraft.editor.job_process", str(self.root / EDITOR_FOLDER), title, *words)
 
 
-def _has_no_photos(flow: Flow, side: Side) -> bool:
-    step = flow.steps[f"{side}/capture"]
-    return isinstance(step, Capture) and is_scene(step.capture)
-
-
-def _rendered_views(flow: Flow, side: Side) -> RenderedViews:
-    step = flow.steps[f"{side}/capture"]
-    return RenderedViews(step.look.up, step.look.look == "within") if isinstance(step, Capture) else RenderedViews()
+def _rendered_views(capture: Capture) -> RenderedViews:
+    return RenderedViews(capture.look.up, capture.look.look == "within")
 
 
 _WEIGHTS = tuple(field.name for field in fields(LayerWeights))

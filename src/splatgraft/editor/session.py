@@ -195,9 +195,9 @@ class Session:
         """Return a placed object with its base."""
         return self.scenes.placeable_object(self.objects()[index])
 
-    def up(self, side: str = "target") -> Float[Tensor, "3"]:
+    def up(self, side: Side = "target") -> Float[Tensor, "3"]:
         """Return the up direction of the target, or of the source."""
-        cameras = self.scenes.cameras(self.files.source_cameras if side == "source" else self.files.target_cameras)
+        cameras = self.scenes.cameras(self.files.scene_and_cameras(side)[1])
         return self.scenes.derive(f"up {side}", (cameras,), lambda: estimate_up(cameras))
 
     def set_placement(self, index: int, target_from_object: Similarity) -> None:

@@ -161,7 +161,8 @@ class Stream:
         return 0.0 if version != view.version else max(0.0, view.moved_at + _REST_SECONDS - now)
 
     def _draw(self, view: View, version: int, scale: float) -> None:
-        orbit, (width, height) = self._artist.orbit(view), view.canvas
+        # the size first: a picture of a new size then shows all moves before it
+        (width, height), orbit = view.canvas, self._artist.orbit(view)
         if orbit is None:
             view.drawn = (version, 1.0)
             return

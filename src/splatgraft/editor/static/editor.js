@@ -43,44 +43,34 @@ async function showPicture(data) {
   send("ack", { n: found.n });
 }
 
+const shapeOf = (points, isClosed) => new Path2D(`M${points.join("L")}${isClosed ? "Z" : ""}`);
+
 function drawOver() {
   const [w, h] = [view.clientWidth, view.clientHeight], ratio = devicePixelRatio || 1;
   [over.width, over.height] = [w * ratio, h * ratio];
   const c = over.getContext("2d");
   c.scale(ratio, ratio);
-  const path = (points, isClosed) => {
-    c.beginPath();
-    points.forEach(([x, y], i) => (i ? c.lineTo(x * w, y * h) : c.moveTo(x * w, y * h)));
-    if (isClosed) c.closePath();
-  };
+  const placed = (points) => points.map(([x, y]) => [x * w, y * h]);
+  const stroke = (shape, color, width) => { c.lineWidth = width; c.strokeStyle = color; c.stroke(shape); };
+  const paint = (shape, color) => { c.fillStyle = color; c.fill(shape); };
   for (const line of head.lines || []) {
-    path(line.points, line.closed);
-    c.lineWidth = line.width || 2;
-    c.strokeStyle = line.color;
-    c.stroke();
+    const points = placed(line.points);
+    stroke(shapeOf(points, line.closed), line.color, line.width || 2);
     if (line.arrow) {
-      const [[a, b], [x, y]] = line.points.map(([u, v]) => [u * w, v * h]), angle = Math.atan2(y - b, x - a);
-      path([-0.4, 0, 0.4].map((turn) => (turn ? [(x - 14 * Math.cos(angle + turn)) / w, (y - 14 * Math.sin(angle + turn)) / h] : [x / w, y / h])), true);
-      c.fillStyle = line.color;
-      c.fill();
+      const [[a, b], [x, y]] = points, angle = Math.atan2(y - b, x - a);
+      const wing = (turn) => [x - 14 * Math.cos(angle + turn), y - 14 * Math.sin(angle + turn)];
+      paint(shapeOf([wing(-0.4), [x, y], wing(0.4)], true), line.color);
     }
   }
   const hover = held && held.on.startsWith("object:") ? Number(held.on.slice(7)) : hoverAt;
   (head.hulls || []).forEach((hull, i) => {
-    if (i !== hover && i !== head.chosen) return;
-    path(hull, true);
-    c.lineWidth = 1.5;
-    c.strokeStyle = i === hover ? "#fffc" : "#fff8";
-    c.stroke();
+    if (i === hover || i === head.chosen) stroke(shapeOf(placed(hull), true), i === hover ? "#fffc" : "#fff8", 1.5);
   });
   for (const dot of head.dots || []) {
-    c.beginPath();
-    c.arc(dot.at[0] * w, dot.at[1] * h, dot.id ? 8 : 6, 0, 7);
-    c.fillStyle = dot.color;
-    c.fill();
-    c.lineWidth = 2;
-    c.strokeStyle = "#fff";
-    c.stroke();
+    const shape = new Path2D(), [[x, y]] = placed([dot.at]);
+    shape.arc(x, y, dot.id ? 8 : 6, 0, 7);
+    paint(shape, dot.color);
+    stroke(shape, "#fff", 2);
   }
   if (held && held.rectangle) {
     const [x, y] = held.from, [u, v] = held.at;
@@ -351,7 +341,7 @@ function under(place) {
   const [w, h] = [view.clientWidth, view.clientHeight];
   const dot = (head.dots || []).findLast((one) => one.id && Math.hypot((one.at[0] - place[0]) * w, (one.at[1] - place[1]) * h) < 14);
   if (dot) return dot.id;
-  const index = (head.hulls || []).findLastIndex((hull) => plane.isPointInPath(new Path2D(`M${hull.join("L")}Z`), ...place));
+  const index = (head.hulls || []).findLastIndex((hull) => plane.isPointInPath(shapeOf(hull, true), ...place));
   return index < 0 ? "" : `object:${index}`;
 }
 
