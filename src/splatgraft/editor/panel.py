@@ -39,10 +39,8 @@ class Pointer:
 
     what: str
     """Kind: down, move, up, cancel, click, or rectangle."""
-    x: float
-    """Position over the canvas's width."""
-    y: float
-    """Position over its height."""
+    place: tuple[float, float]
+    """Position over the canvas's sides."""
     on: str = ""
     """Name of the object or dot that was grabbed; empty if there was none."""
     mode: str = "move"
@@ -64,12 +62,8 @@ class Pointer:
         words = [message.get(name, "") for name in ("what", "on", "mode")]
         if not all(isinstance(word, str) for word in words):
             raise ValueError("pointer: expected words, found others")
-        return Pointer(words[0], x, y, words[1], words[2], bool(message.get("alt")), bool(message.get("shift")), (u, v))
-
-    @property
-    def place(self) -> tuple[float, float]:
-        """Position over the canvas's sides."""
-        return self.x, self.y
+        alt, shift = (bool(message.get(name)) for name in ("alt", "shift"))
+        return Pointer(words[0], (x, y), words[1], words[2], alt, shift, (u, v))
 
 
 class Panel:

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -182,7 +183,7 @@ class RelitPreview:
             values, parts, coarse = self._draft_values, [target, *objects], target.gaussians
             for i, source in enumerate(sources):
                 if source is not None:
-                    sources[i] = small = self._coarse_source(source)
+                    sources[i] = small = memo.get("coarse source", (source,), partial(_coarse_source, source))
                     pair = (objects[i].gaussians, small)
                     values.share_source_light(pair, self._full_values, (given[i], source))
             drawn = Composite(
@@ -199,13 +200,11 @@ class RelitPreview:
     def _cameras(self) -> Cameras:
         return self._scenes.cameras(self._scenes.files.target_cameras)
 
-    def _coarse_source(self, source: SourceScene) -> SourceScene:
-        def make() -> SourceScene:
-            return replace(source, gaussians=coarsen(source.gaussians, TARGET_BUDGET).gaussians)
-
-        return self._memo.get("coarse source", (source,), make)
-
 
 def _is_large(composite: Composite) -> bool:
     objects = [one.gaussians.count for one in composite.objects]
     return composite.kept_count > TARGET_BUDGET or max(objects, default=0) > OBJECT_BUDGET
+
+
+def _coarse_source(source: SourceScene) -> SourceScene:
+    return replace(source, gaussians=coarsen(source.gaussians, TARGET_BUDGET).gaussians)

@@ -18,6 +18,7 @@ from splatgraft.editor.picking import Ray, Rectangle, brush_selection, in_rectan
 from splatgraft.editor.state import EditState
 from splatgraft.editor.stream import View
 from splatgraft.editor.worker import LatestOnlyWorker
+from splatgraft.runtime.memo import Memo
 from splatgraft.segmentation import Box, Keep, default_box
 
 if TYPE_CHECKING:
@@ -46,8 +47,7 @@ class SelectPanel(Panel):
         self._brush_size = 0.1
         self._stroke: list[Ray] = []
         self._touched: Tensor | None = None
-        self._outlines: tuple[EditState | None, dict[int, Any]] = (None, {})
-        """Outlines by the clicks of one state, for each photo."""
+        self._memo = Memo()
         self._finder = LatestOnlyWorker(self._find_outline, lambda error: editor.say(str(error), bad=True))
 
     def close(self) -> None:
@@ -148,24 +148,16 @@ class SelectPanel(Panel):
         state = self.session.state
         if not state.prompts or state.mask_source not in _TAKES_POINTS:
             return []
-        known, found = self._outlines
-        if known is None or known.prompts is not state.prompts:
-            self._outlines = (state, found := {})
+        found = self._memo.get("outlines by photo", (state.prompts,), dict)
         if photo not in found:
             found[photo] = []
-            self._finder.submit((state, photo))
+            self._finder.submit((state, photo, found))
         return found[photo]
 
-    def _find_outline(self, asked: tuple[EditState, int]) -> None:
-        state, photo = asked
-        pictures = self.editor.pictures
-        if pictures is None:
-            return
-        lines = pictures.outline(state, photo)
-        known, found = self._outlines
-        if known is not None and known.prompts is state.prompts:
-            found[photo] = lines
-            self.editor.stream.touch()
+    def _find_outline(self, asked: tuple[EditState, int, dict[int, Any]]) -> None:
+        state, photo, found = asked
+        found[photo] = self.pictures.outline(state, photo)
+        self.editor.stream.touch()
 
     # the pointer
 

@@ -117,7 +117,7 @@ class Server:
         self._client: Client | None = None
         self._windows: list[Window] = []
         self._numbers = itertools.count(1)
-        self._uploads = 0
+        self._uploads = asyncio.Semaphore(_MAX_UPLOADS)
         self._lock = threading.Lock()
         listener = _listener(host, port)
         self.port: int = listener.getsockname()[1]
@@ -183,25 +183,23 @@ class Server:
             is_editing = bool(self._windows) and query.get("window") == str(self._windows[0].number)
         if client is None or not is_editing:
             return _refusal("another window edits", 403)
-        if self._uploads >= _MAX_UPLOADS:
+        if self._uploads.locked():
             return _refusal(f"expected at most {_MAX_UPLOADS} uploads at once, found one more", 429)
-        self._uploads += 1
-        try:
-            path = client.upload_path(query.get("name", ""))
-            announced = request.headers.get("Content-Length", "0")
-            if not announced.isdecimal() or int(announced) > _MAX_UPLOAD_BYTES:
-                return _too_large()
-            size = 0
-            with atomic_write(path) as stream:
-                async for part in request.stream():
-                    size += len(part)
-                    if size > _MAX_UPLOAD_BYTES:
-                        return _too_large()
-                    await asyncio.to_thread(stream.write, part)
-        except (ValueError, OSError) as error:
-            return _refusal(" ".join(str(error).split()), 400)
-        finally:
-            self._uploads -= 1
+        async with self._uploads:
+            try:
+                path = client.upload_path(query.get("name", ""))
+                announced = request.headers.get("Content-Length", "0")
+                if not announced.isdecimal() or int(announced) > _MAX_UPLOAD_BYTES:
+                    return _too_large()
+                size = 0
+                with atomic_write(path) as stream:
+                    async for part in request.stream():
+                        size += len(part)
+                        if size > _MAX_UPLOAD_BYTES:
+                            return _too_large()
+                        await asyncio.to_thread(stream.write, part)
+            except (ValueError, OSError) as error:
+                return _refusal(" ".join(str(error).split()), 400)
         await asyncio.to_thread(client.uploaded, path, query.get("use", ""))
         return PlainTextResponse(str(path))
 

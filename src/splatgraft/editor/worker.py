@@ -26,11 +26,6 @@ class LatestOnlyWorker(Generic[T]):
             self._waiting = [request]
             self._wake.notify()
 
-    @property
-    def closed(self) -> bool:
-        """Whether the worker was closed; the target of its output may be gone."""
-        return not self._open
-
     def wait_idle(self, seconds: float) -> bool:
         """Wait at most `seconds` for a newer request; return whether none arrived."""
         with self._wake:
@@ -53,5 +48,5 @@ class LatestOnlyWorker(Generic[T]):
             try:
                 self._work(request)
             except Exception as error:  # one failed request must not end the thread
-                if not self.closed:
+                if self._open:  # else the target of its output may be gone
                     self._on_error(error)

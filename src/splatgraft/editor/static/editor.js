@@ -352,7 +352,7 @@ view.addEventListener("pointerdown", (event) => {
   view.setPointerCapture(event.pointerId);
   pointers.set(event.pointerId, at(event));
   if (pointers.size > 1) { // a second finger: the view is moved and zoomed
-    if (held && held.isSent) send("pointer", { what: "cancel", on: held.on, x: held.at[0], y: held.at[1] });
+    if (held && held.isSent) point("cancel");
     held = { kind: "pinch", on: "" };
     return;
   }
@@ -362,7 +362,7 @@ view.addEventListener("pointerdown", (event) => {
   if (panel.editing && panel.rectangle && event.shiftKey) held.rectangle = true;
   else if (on || (panel.editing && panel.paint && !isRight)) held.kind = "drag";
   else held.kind = isRight || event.shiftKey || event.ctrlKey ? "pan" : "turn";
-  if (held.kind === "drag" && (on || panel.paint)) point("down");
+  if (held.kind === "drag") point("down");
 });
 function point(what) {
   held.isSent = true;
@@ -389,9 +389,10 @@ view.addEventListener("pointermove", (event) => {
   held.hasMoved ||= Math.hypot(event.clientX - held.px[0], event.clientY - held.px[1]) > CLICK_PX;
   if (!held.hasMoved) return;
   const [dx, dy] = [place[0] - held.at[0], place[1] - held.at[1]];
-  if (held.rectangle) { held.at = place; drawOver(); }
-  else if (held.kind === "drag") { held.at = place; held.alt = event.altKey; throttled(() => held && held.kind === "drag" && point("move")); }
-  else { held.at = place; send(held.kind, { x: (dx * w) / h, y: dy }); }
+  held.at = place;
+  if (held.rectangle) drawOver();
+  else if (held.kind === "drag") { held.alt = event.altKey; throttled(() => held && held.kind === "drag" && point("move")); }
+  else send(held.kind, { x: (dx * w) / h, y: dy });
 });
 function release(event) {
   pointers.delete(event.pointerId);
@@ -402,7 +403,8 @@ function release(event) {
     if (isUp && held.hasMoved) send("pointer", { what: "rectangle", x: held.from[0], y: held.from[1], u: held.at[0], v: held.at[1], alt: held.alt });
   } else if (held.isSent) point(isUp && (held.hasMoved || panel.paint) ? "up" : "cancel");
   if (isUp && !held.hasMoved && !held.rectangle && panel.editing && !(panel.paint && held.isSent)) {
-    send("pointer", { what: "click", on: "", x: held.at[0], y: held.at[1], mode, alt: held.alt, shift: held.shift });
+    held.on = "";
+    point("click");
   }
   held = null;
   drawOver();
