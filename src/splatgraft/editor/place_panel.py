@@ -36,6 +36,7 @@ from splatgraft.editor.sky_dome import SkyDome
 from splatgraft.editor.state import check_numbers, check_state
 from splatgraft.editor.stream import View
 from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
+from splatgraft.project.layout import Side
 from splatgraft.project.placement import ObjectPlacement
 from splatgraft.runtime.memo import Memo
 from splatgraft.segmentation import Box
@@ -120,12 +121,10 @@ class PlacePanel(Panel):
         angles = [round(angle, 2) + 0.0 for angle in degrees_of(self._one()[1].rotation)]
         hint = "Degrees about x, y, z"
         form.numbers("rotation", "Rotation", angles, lambda v: self._typed(degrees=v), step=0.01, hint=hint)
-        snap = self._sets("_snaps")
-        form.check("snap", "Snap", self._snaps, snap, hint="Turns by 15 degrees (Shift+S)")
-        known = self._sets("_known_cm")
-        form.number("known", "True height, cm", self._known_cm, known, hint="As measured")
-        sets = {"Scale of its photos": True, "Scale of the place": False}
-        form.buttons("sets", {label: partial(self._set_scale, own=own) for label, own in sets.items()})
+        form.check("snap", "Snap", self._snaps, self._sets("_snaps"), hint="Turns by 15 degrees (Shift+S)")
+        form.number("known", "True height, cm", self._known_cm, self._sets("_known_cm"), hint="As measured")
+        sets: dict[str, Side] = {"Scale of its photos": "source", "Scale of the place": "target"}
+        form.buttons("sets", {label: partial(self._set_scale, side) for label, side in sets.items()})
 
     def _build_size(self, form: Form) -> None:
         try:
@@ -138,7 +137,7 @@ class PlacePanel(Panel):
             form.number("height", "Height, cm", round(here, 2), self._resize, step=0.01, hint="In the place")
             if true is not None and abs(here / true - 1) > _SAME:
                 form.button("true_size", "As tall as it truly is", lambda: self._resize(true))
-        given = self.session.files.place_options.scale
+        given = self.session.files.compose.options.scale
         is_given = given is not None and abs(size.scale / given - 1) < _SAME
         form.note(_about(size, is_given=is_given), name="size", faint=True)
 
@@ -190,7 +189,7 @@ class PlacePanel(Panel):
         session = self.session
         item = session.scenes.placeable_object(ObjectPlacement(Similarity.identity()))
         cameras = session.scenes.cameras(session.files.target_cameras)
-        options = session.files.place_options
+        options = session.files.compose.options
         # as `compose` does
         options = replace(options, scale=session.true_scale()) if options.scale is None else options
         placed = suggest_placement(session.scenes.gaussians(session.files.target_scene), item, cameras, options)
@@ -242,14 +241,11 @@ class PlacePanel(Panel):
     def _resize(self, here_cm: float) -> None:
         self._place(rescale(*self._one(), self.session.size(self._chosen).scale_at(here_cm)))
 
-    def _set_scale(self, *, own: bool) -> None:
+    def _set_scale(self, side: Side) -> None:
         session, cm = self.session, self._known_cm
-        if own:
-            path = session.set_own_scale(self._chosen, cm)
-            if session.size(self._chosen).place is not None:
-                self._resize(cm)
-        else:
-            path = session.set_place_scale(self._chosen, cm)
+        path = session.set_scale(self._chosen, cm, side)
+        if side == "source" and session.size(self._chosen).place is not None:
+            self._resize(cm)
         self.editor.say(f"stored in {path}, as `splatgraft scale` does; Undo leaves it")
 
     # keys

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal
 
 from splatgraft.commands.init import Init
-from splatgraft.composition import PlaceOptions
 from splatgraft.editor.placement import Triple
 from splatgraft.exports.export import Layer
 from splatgraft.formats import is_scene
@@ -22,7 +21,7 @@ from splatgraft.project.layout import (
     Side,
 )
 from splatgraft.project.toml_edit import with_keys
-from splatgraft.relighting import LayerWeights, RelightOptions
+from splatgraft.relighting import LayerWeights
 from splatgraft.runtime.console import Console
 from splatgraft.runtime.files import atomic_write, relative_name
 from splatgraft.steps.capture import Capture
@@ -81,12 +80,10 @@ class ProjectFiles:
     """Whether source and target are scenes without photographs, whose images are rendered from the scene."""
     rendered_views: tuple[RenderedViews, RenderedViews]
     """Options for rendering the images of source and target, used for scenes without photographs."""
-    light_mode: Literal["transfer", "off"]
-    """`light` of [relight]: the physical transfer, or none."""
-    relight_options: RelightOptions
-    """`options` of [relight]."""
-    place_options: PlaceOptions
-    """Placement options of [compose], for objects without a placement."""
+    compose: Compose
+    """The step that places the objects."""
+    relight: Relight
+    """The step of the light transfer."""
 
     def scene_and_cameras(self, side: Side) -> tuple[Path, Path]:
         """Return the reconstruction of a side and its transforms.json."""
@@ -102,7 +99,7 @@ class ProjectFiles:
     @property
     def transfers_light(self) -> bool:
         """Whether the physical light transfer is used, so that there is a light to estimate and edit."""
-        return self.light_mode == "transfer"
+        return self.relight.light == "transfer"
 
 
 @dataclass(frozen=True)
@@ -148,9 +145,8 @@ class Project:
             report=layout.report,
             without_photos=(is_scene(source.capture), is_scene(target.capture)),
             rendered_views=(_rendered_views(source), _rendered_views(target)),
-            light_mode=relight.light,
-            relight_options=relight.options,
-            place_options=compose.options,
+            compose=compose,
+            relight=relight,
         )
 
     def reasons(self) -> Mapping[str, str | None]:

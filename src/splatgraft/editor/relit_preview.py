@@ -120,7 +120,7 @@ class RelitPreview:
 
         This takes less time than `relit`. Return None if nothing was moved or these layers exist already.
         """
-        options, composite = self._scenes.files.relight_options, self._scenes.composite(state)
+        options, composite = self._scenes.files.relight.options, self._scenes.composite(state)
         is_moved = self._full_values.is_moved(composite, self._cameras(), state.light, options)
         if not is_moved or self._memo.peek("refined", self._inputs(state)) is not None:
             return None
@@ -152,7 +152,7 @@ class RelitPreview:
         return found
 
     def _inputs(self, state: EditState) -> tuple[Any, ...]:
-        return (self._scenes.composite(state), state.light, repr(self._scenes.files.relight_options))
+        return (self._scenes.composite(state), state.light, repr(self._scenes.files.relight.options))
 
     def _transfer(self, state: EditState, *, exact: bool) -> Relit:
         return self._full_values.relight(
@@ -160,7 +160,7 @@ class RelitPreview:
             self._cameras(),
             sources=self._scenes.source_scenes(state),
             light=state.light,
-            options=self._scenes.files.relight_options,
+            options=self._scenes.files.relight.options,
             exact=exact,
         )
 
@@ -193,7 +193,7 @@ class RelitPreview:
                 ),
                 erased=memo.get("none erased", (coarse,), lambda: torch.zeros(coarse.count, dtype=torch.bool)),
             )
-        options = replace(self._scenes.files.relight_options, most_added=0.0, fitted_views=0)
+        options = replace(self._scenes.files.relight.options, most_added=0.0, fitted_views=0)
         relit = values.relight(drawn, self._cameras(), sources=sources, light=state.light, options=options, exact=False)
         return coarse_draft(relit, parts) if parts else Draft(relit, torch.arange(relit.gaussians.count))
 

@@ -223,23 +223,20 @@ class Session:
         own, place = read_scale(self.files.source_cameras), read_scale(self.files.target_cameras)
         return None if own is None or place is None else own.metres_per_unit / place.metres_per_unit
 
-    def set_own_scale(self, index: int, true_cm: float) -> Path:
-        """Store the scale of an object's own capture from the object's true height; return the file."""
-        check_height_cm(true_cm)
-        path = self.scenes.object_path(self.objects()[index])
-        if path != self.files.object:
+    def set_scale(self, index: int, cm: float, side: Side) -> Path:
+        """Store the scale of a capture from the height of a placed object in it; return the file."""
+        check_height_cm(cm)
+        size, path = self.size(index), self.scenes.object_path(self.objects()[index])
+        if side == "target":
+            height, by = size.scale * size.height, "a placed object's"
+        elif path == self.files.object:
+            height, by = size.height, "the object's"
+        else:
             raise ValueError(
                 f"{path}: expected the object of the project's source, found one that was added from a file"
             )
-        found = MetricScale(0.01 * true_cm / self.size(index).height, f"the object's height of {true_cm:g} cm")
-        return write_scale(self.files.source_cameras, found)
-
-    def set_place_scale(self, index: int, here_cm: float) -> Path:
-        """Store the scale of the target's capture from a placed object's height in it; return the file."""
-        check_height_cm(here_cm)
-        size = self.size(index)
-        found = MetricScale(0.01 * here_cm / (size.scale * size.height), f"a placed object's height of {here_cm:g} cm")
-        return write_scale(self.files.target_cameras, found)
+        found = MetricScale(0.01 * cm / height, f"{by} height of {cm:g} cm")
+        return write_scale(self.files.scene_and_cameras(side)[1], found)
 
     # jobs
 
