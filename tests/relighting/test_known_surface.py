@@ -15,6 +15,7 @@ from splatgraft.core.spherical_harmonics import colors
 from splatgraft.relighting import Light, LightSource, RelightOptions, Relit, SourceScene, relight
 from splatgraft.relighting.light.light import fit_ambient
 from splatgraft.relighting.materials import ReflectedLight, known_materials
+from splatgraft.relighting.transfer import TransferValues
 
 WHOLE = RelightOptions(most_added=0.0, fitted_views=0)
 SUN = (0.36, 0.48, 0.8)
@@ -177,3 +178,12 @@ def test_mesh_and_captured_object_stand_side_by_side():
     # the captured one keeps its mean brightness, the mesh does not
     shade = relit.shade[relit.is_object]
     assert float(shade[known.count :].log().mean()) == pytest.approx(0, abs=0.01)
+
+
+def test_a_mesh_of_a_file_keeps_its_known_light_in_later_transfers():
+    target, placed = floor(), PlacedObject(ball(0.4), Similarity(1.0, torch.eye(3), torch.tensor([0.0, 0.0, 0.3])))
+    composite = Composite(target, (placed,), torch.zeros(target.count, dtype=torch.bool))
+    values, light = TransferValues(lambda: None), sky(0.2, LightSource(SUN, (2.0, 2.0, 2.0)))
+    for _ in range(2):
+        relit = values.relight(composite, ring(), sources=[None], light=light, options=WHOLE, exact=False)
+        assert relit.prepared[0].source_lighting is not None
