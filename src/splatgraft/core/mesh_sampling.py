@@ -250,7 +250,7 @@ def _looked_up(
         footprint: Area of each average, squares of texture coordinates.
         is_srgb: Whether its colours are sRGB; alpha never is.
     """
-    matrix = np.array(texture.image_from_uv)
+    matrix = texture.image_from_uv
     at = uv @ matrix[:, :2].T + matrix[:, 2]
     for axis, wrap in enumerate(texture.wrap):
         values = at[:, axis]

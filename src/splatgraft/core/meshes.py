@@ -1,11 +1,14 @@
 """The value `Mesh`: textured triangles with metallic-roughness materials, as in glTF 2.0."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+MAX_TRIANGLES = 4_000_000
+"""Largest number of triangles that is read; they take 600 MB."""
 Wrap = Literal["repeat", "mirror", "clamp"]
 
 
@@ -17,13 +20,13 @@ class Texture:
     """Red, green, blue, alpha; row 0 is at v = 0."""
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
     """Continuation of the image outside [0, 1], along u and v."""
-    image_from_uv: tuple[tuple[float, float, float], tuple[float, float, float]] = ((1, 0, 0), (0, 1, 0))
+    image_from_uv: Float[np.ndarray, "2 3"] = field(default_factory=lambda: np.eye(2, 3))
     """Affine map of texture coordinates."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MeshMaterial:
-    """A metallic-roughness material; maps are multiplied with the numbers of the same name."""
+    """A metallic-roughness material; maps are multiplied with the numbers of the same name, None is white."""
 
     color: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     """Base colour, linear rgb, and alpha."""
@@ -42,7 +45,7 @@ class MeshMaterial:
     surface_map: Texture | None = None
     """Roughness in green and metallic in blue, linear."""
     normal_map: Texture | None = None
-    """Normals in tangent space: x along u, y against v of the image."""
+    """Normals in tangent space: x along u, y against v of the image; None for no relief."""
     emission_map: Texture | None = None
     """Emission, sRGB."""
 
@@ -64,17 +67,48 @@ class Mesh:
     materials: tuple[MeshMaterial, ...]
 
 
-MAX_TRIANGLES = 4_000_000
-"""Largest number of triangles that is read; they take 600 MB."""
+def make_mesh(
+    positions: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "t 3"],
+    *,
+    material: MeshMaterial,
+    normals: Float[np.ndarray, "v 3"] | None = None,
+    uv: Float[np.ndarray, "v 2"] | None = None,
+    colors: Float[np.ndarray, "v 3"] | None = None,
+) -> Mesh:
+    """Make a mesh of one material from the values of its v vertices.
+
+    Normals may have any length; None or 0 stands for those of the triangles' planes.
+
+    Raises:
+        ValueError: A value is not finite.
+    """
+    normals = np.zeros_like(positions) if normals is None else normals
+    uv = np.zeros((len(positions), 2), np.float32) if uv is None else uv
+    colors = np.ones(positions.shape, np.float32) if colors is None else colors
+    corners, given, uv, colors = (values[faces] for values in (positions, normals, uv, colors))
+    if not all(np.isfinite(values).all() for values in (corners, given, uv, colors)):
+        raise ValueError("expected finite positions, normals, texture coordinates and colours, found others")
+    flat = unit(area_vectors(corners))[:, None]
+    normals = np.where((given != 0).any(-1, keepdims=True), unit(given), flat)
+    return Mesh(corners, normals, uv, colors, np.zeros(len(faces), np.int64), (material,))
 
 
-def flat_normals(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3 3"]:
-    """Compute the normals of the triangles' planes at each corner; 0 for a triangle without area."""
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.repeat(unit(across)[:, None], 3, 1)
+def concatenate(parts: Sequence[Mesh]) -> Mesh:
+    """Join meshes; a material that several parts share appears once."""
+    materials = list(dict.fromkeys(material for part in parts for material in part.materials))
+    material = [np.array([materials.index(one) for one in part.materials])[part.material] for part in parts]
+    names = ("corners", "normals", "uv", "colors")
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Mesh(**joined, material=np.concatenate(material), materials=tuple(materials))
 
 
-def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+def area_vectors(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3"]:
+    """Compute the normals of the triangles' planes times twice the areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def unit(vectors: Float[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n k"]:
     """Normalise vectors; 0 stays 0."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1)

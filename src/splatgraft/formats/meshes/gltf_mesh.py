@@ -5,47 +5,47 @@ ones are named in a note, or refused if the file requires them.
 """
 
 import io
-from dataclasses import replace
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from splatgraft.core.meshes import MAX_TRIANGLES, Mesh, MeshMaterial, Texture, Wrap, flat_normals, unit
+from splatgraft.core.meshes import MAX_TRIANGLES, Mesh, MeshMaterial, Texture, Wrap, concatenate, make_mesh
 from splatgraft.formats.gltf import AXES, Gltf, read_uri
 from splatgraft.formats.scenes.axes import rdf_from
 
 _READ = {"KHR_texture_transform", "EXT_texture_webp", "KHR_materials_emissive_strength", "KHR_mesh_quantization"}
 _COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu"}
 _MAX_PIXELS = 1 << 26  # of one texture; 8192 x 8192
-_WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_REPEAT = 10497
+_WRAPS: dict[int, Wrap] = {33071: "clamp", 33648: "mirror", _REPEAT: "repeat"}
+_TRIANGLES, _FAN = 4, 6  # modes of a primitive; between them are strips, below them points and lines
 
 
 def read_gltf_mesh(gltf: Gltf, path: Path) -> tuple[Mesh, tuple[str, ...]]:
     """Read the triangles of all primitives, placed by their nodes; returns notes for the user as well."""
     notes = _check_extensions(gltf.content)
-    materials = _Materials(gltf, path)
+    image = cache(lambda index: _image(gltf, path, index))
+    material = cache(lambda index: _material(gltf, index, image))
     parts: list[Mesh] = []
-    count = 0
+    count = unused = 0
     for mesh, matrix in gltf.placed_meshes():
         for primitive in mesh["primitives"]:
             if primitive.get("mode", _TRIANGLES) < _TRIANGLES:
-                notes = (*notes, "its points and lines are not used") if len(notes) < 2 else notes
+                unused += 1
                 continue
-            vertex = _corners(gltf, primitive)
-            count += len(vertex)
+            faces = _faces(gltf, primitive)
+            count += len(faces)
             if count > MAX_TRIANGLES:
                 raise ValueError(f"expected at most {MAX_TRIANGLES:,} triangles, found {count:,} or more")
-            parts.append(_placed(gltf, primitive, vertex, matrix))
+            parts.append(_placed(gltf, primitive, faces, matrix, material(primitive.get("material"))))
     if not count:
         raise ValueError("expected a mesh or Gaussians, found a glTF without triangles")
-    used = np.unique(np.concatenate([part.material for part in parts]))
-    joined = {n: np.concatenate([getattr(part, n) for part in parts]) for n in ("corners", "normals", "uv", "colors")}
-    material = np.searchsorted(used, np.concatenate([part.material for part in parts]))
-    return Mesh(**joined, material=material, materials=tuple(materials.read(int(i)) for i in used)), notes
+    return concatenate(parts), (*notes, "its points and lines are not used") if unused else notes
 
 
 def _check_extensions(content: dict[str, Any]) -> tuple[str, ...]:
@@ -60,7 +60,7 @@ def _check_extensions(content: dict[str, Any]) -> tuple[str, ...]:
     return (f"not used: {', '.join(unread[:4])}",) if unread else ()
 
 
-def _corners(gltf: Gltf, primitive: dict[str, Any]) -> Int[np.ndarray, "t 3"]:
+def _faces(gltf: Gltf, primitive: dict[str, Any]) -> Int[np.ndarray, "t 3"]:
     """Return the vertices of each triangle."""
     vertices = len(gltf.values(primitive["attributes"]["POSITION"], "VEC3"))
     index = np.arange(vertices)
@@ -72,99 +72,88 @@ def _corners(gltf: Gltf, primitive: dict[str, Any]) -> Int[np.ndarray, "t 3"]:
     if mode == _TRIANGLES:
         return index[: len(index) // 3 * 3].reshape(-1, 3)
     first = np.arange(max(len(index) - 2, 0))
-    if mode == _FAN:
-        return np.stack([index[:1].repeat(len(first)), index[first + 1], index[first + 2]], 1)
     odd = first % 2  # every other triangle of a strip runs the other way
-    return np.stack([index[first], index[first + 1 + odd], index[first + 2 - odd]], 1)
+    corners = (0 * first, first + 1, first + 2) if mode == _FAN else (first, first + 1 + odd, first + 2 - odd)
+    return index[np.stack(corners, 1)]
 
 
-def _placed(gltf: Gltf, primitive: dict[str, Any], vertex: Int[np.ndarray, "t 3"], matrix: np.ndarray) -> Mesh:
+def _placed(
+    gltf: Gltf,
+    primitive: dict[str, Any],
+    faces: Int[np.ndarray, "t 3"],
+    matrix: Float[np.ndarray, "4 4"],
+    material: MeshMaterial,
+) -> Mesh:
     """Read one primitive; a mirroring transform turns its triangles round."""
     attributes = primitive["attributes"]
-    linear = rdf_from(AXES).numpy().astype(np.float64) @ matrix[:3, :3]
-    shift = rdf_from(AXES).numpy() @ matrix[:3, 3]
-    if np.linalg.det(linear) < 0:
-        vertex = vertex[:, ::-1]
-    corners = (gltf.floats(attributes["POSITION"], "VEC3").astype(np.float64) @ linear.T + shift)[vertex]
-    if not np.isfinite(corners).all():
-        raise ValueError("expected finite positions, found others")
-    normals = flat_normals(corners)
-    if "NORMAL" in attributes:
+    turned = rdf_from(AXES).numpy() @ matrix[:3]
+    linear, shift = turned[:, :3], turned[:, 3]
+    side = np.sign(np.linalg.det(linear) or 1)
+
+    def values(name: str, *kinds: str) -> Float[np.ndarray, "v c"] | None:
+        return gltf.floats(attributes[name], *kinds) if name in attributes else None
+
+    normals, colors = values("NORMAL", "VEC3"), values("COLOR_0", "VEC3", "VEC4")
+    if normals is not None:
         # cofactors, which exist for flattened meshes too, and keep a mirrored normal outside
-        cofactors = np.stack([np.cross(linear[(i + 1) % 3], linear[(i + 2) % 3]) for i in range(3)])
-        turned = gltf.floats(attributes["NORMAL"], "VEC3") @ cofactors.T * np.sign(np.linalg.det(linear) or 1)
-        normals = np.where((turned != 0).any(1)[vertex][..., None], unit(turned)[vertex], normals)
-    uv = np.zeros((len(vertex), 3, 2), np.float32)
-    if "TEXCOORD_0" in attributes:
-        uv = gltf.floats(attributes["TEXCOORD_0"], "VEC2")[vertex]
-    colors = np.ones_like(corners, np.float32)
-    if "COLOR_0" in attributes:
-        colors = gltf.floats(attributes["COLOR_0"], "VEC3", "VEC4")[vertex][..., :3]
-    material = np.full(len(vertex), primitive.get("material", -1))
-    return Mesh(corners, normals, uv, colors, material, ())
+        normals = normals @ np.cross(np.roll(linear, -1, 0), np.roll(linear, -2, 0)).T * side
+    return make_mesh(
+        gltf.floats(attributes["POSITION"], "VEC3").astype(np.float64) @ linear.T + shift,
+        faces if side > 0 else faces[:, ::-1],
+        material=material,
+        normals=normals,
+        uv=values("TEXCOORD_0", "VEC2"),
+        colors=None if colors is None else colors[:, :3],
+    )
 
 
-class _Materials:
-    """Reader of a file's materials; each image is decoded once."""
-
-    def __init__(self, gltf: Gltf, path: Path) -> None:
-        self._gltf, self._path = gltf, path
-        self._images: dict[int, np.ndarray] = {}
-
-    def read(self, index: int) -> MeshMaterial:
-        """Read a material; the default one for -1."""
-        found: dict[str, Any] = {} if index < 0 else self._gltf.content["materials"][index]
-        surface, extensions = found.get("pbrMetallicRoughness", {}), found.get("extensions", {})
-        strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
-        r, g, b, a = surface.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0))
-        er, eg, eb = (strength * x for x in found.get("emissiveFactor", (0.0, 0.0, 0.0)))
-        mode, cutoff = found.get("alphaMode", "OPAQUE"), found.get("alphaCutoff", 0.5)
-        return MeshMaterial(
-            color=(r, g, b, a),
-            metallic=surface.get("metallicFactor", 1.0),
-            roughness=surface.get("roughnessFactor", 1.0),
-            emission=(er, eg, eb),
-            # a half transparent surface has no place among opaque Gaussians, so half decides
-            alpha_cutoff={"OPAQUE": 0.0, "MASK": cutoff}.get(mode, 0.5),
-            normal_scale=found.get("normalTexture", {}).get("scale", 1.0),
-            color_map=self._texture(surface.get("baseColorTexture")),
-            surface_map=self._texture(surface.get("metallicRoughnessTexture")),
-            normal_map=self._texture(found.get("normalTexture")),
-            emission_map=self._texture(found.get("emissiveTexture")),
-        )
-
-    def _texture(self, use: dict[str, Any] | None) -> Texture | None:
-        if use is None:
-            return None
-        transform = use.get("extensions", {}).get("KHR_texture_transform", {})
-        if transform.get("texCoord", use.get("texCoord", 0)) != 0:
-            raise ValueError("expected textures on the first texture coordinates, found one on others")
-        texture = self._gltf.content["textures"][use["index"]]
-        source = texture.get("extensions", {}).get("EXT_texture_webp", texture)["source"]
-        if source not in self._images:
-            self._images[source] = self._image(self._gltf.content["images"][source])
-        sampler = self._gltf.content["samplers"][texture["sampler"]] if "sampler" in texture else {}
-        across: Wrap = _WRAPS[sampler.get("wrapS", 10497)]
-        down: Wrap = _WRAPS[sampler.get("wrapT", 10497)]
-        return _transformed(Texture(self._images[source], (across, down)), transform)
-
-    def _image(self, image: dict[str, Any]) -> np.ndarray:
-        data = self._gltf.view(image["bufferView"]) if "bufferView" in image else read_uri(self._path, image["uri"])
-        return decode_image(data)
+def _material(gltf: Gltf, index: int | None, image: Callable[[int], np.ndarray]) -> MeshMaterial:
+    """Read a material; the default one for None."""
+    found: dict[str, Any] = {} if index is None else gltf.content["materials"][index]
+    surface, extensions = found.get("pbrMetallicRoughness", {}), found.get("extensions", {})
+    strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+    red, green, blue = (strength * x for x in found.get("emissiveFactor", (0.0, 0.0, 0.0)))
+    return MeshMaterial(
+        color=surface.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0)),
+        metallic=surface.get("metallicFactor", 1.0),
+        roughness=surface.get("roughnessFactor", 1.0),
+        emission=(red, green, blue),
+        # a half transparent surface has no place among opaque Gaussians, so half decides
+        alpha_cutoff={"OPAQUE": 0.0, "MASK": found.get("alphaCutoff", 0.5)}.get(found.get("alphaMode", "OPAQUE"), 0.5),
+        normal_scale=found.get("normalTexture", {}).get("scale", 1.0),
+        color_map=_texture(gltf, surface.get("baseColorTexture"), image),
+        surface_map=_texture(gltf, surface.get("metallicRoughnessTexture"), image),
+        normal_map=_texture(gltf, found.get("normalTexture"), image),
+        emission_map=_texture(gltf, found.get("emissiveTexture"), image),
+    )
 
 
-def decode_image(data: bytes) -> np.ndarray:
-    """Decode a PNG, JPEG or WebP to (h, w, 4) bytes."""
-    with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "WEBP")) as picture:
-        if picture.width * picture.height > _MAX_PIXELS:
-            raise ValueError(f"expected a texture of at most 8192 x 8192, found {picture.width} x {picture.height}")
-        return np.asarray(picture.convert("RGBA"))
-
-
-def _transformed(texture: Texture, transform: dict[str, Any]) -> Texture:
-    """Apply a KHR_texture_transform: offset, counterclockwise rotation and scale."""
+def _texture(gltf: Gltf, use: dict[str, Any] | None, image: Callable[[int], np.ndarray]) -> Texture | None:
+    """Read a texture; KHR_texture_transform scales, turns counterclockwise and shifts its coordinates."""
+    if use is None:
+        return None
+    transform = use.get("extensions", {}).get("KHR_texture_transform", {})
+    if transform.get("texCoord", use.get("texCoord", 0)) != 0:
+        raise ValueError("expected textures on the first texture coordinates, found one on others")
+    texture = gltf.content["textures"][use["index"]]
+    source = texture.get("extensions", {}).get("EXT_texture_webp", texture)["source"]
+    sampler = gltf.content["samplers"][texture["sampler"]] if "sampler" in texture else {}
+    wrap = _WRAPS[sampler.get("wrapS", _REPEAT)], _WRAPS[sampler.get("wrapT", _REPEAT)]
     (u, v), (across, down) = transform.get("offset", (0.0, 0.0)), transform.get("scale", (1.0, 1.0))
     cosine, sine = np.cos(transform.get("rotation", 0.0)), np.sin(transform.get("rotation", 0.0))
-    rows: Float[np.ndarray, "2 3"] = np.array([[cosine * across, sine * down, u], [-sine * across, cosine * down, v]])
-    first, second = ((float(a), float(b), float(c)) for a, b, c in rows)
-    return replace(texture, image_from_uv=(first, second))
+    image_from_uv = np.array([[cosine * across, sine * down, u], [-sine * across, cosine * down, v]])
+    return Texture(image(source), wrap, image_from_uv)
+
+
+def _image(gltf: Gltf, path: Path, index: int) -> UInt8[np.ndarray, "h w 4"]:
+    image = gltf.content["images"][index]
+    data = gltf.view(image["bufferView"]) if "bufferView" in image else read_uri(path, image["uri"])
+    with Image.open(io.BytesIO(data), formats=("PNG", "JPEG", "WEBP")) as picture:
+        return texture_pixels(picture)
+
+
+def texture_pixels(picture: Image.Image) -> UInt8[np.ndarray, "h w 4"]:
+    """Decode a picture of at most 8192 x 8192 pixels."""
+    if picture.width * picture.height > _MAX_PIXELS:
+        raise ValueError(f"expected a texture of at most 8192 x 8192, found {picture.width} x {picture.height}")
+    return np.asarray(picture.convert("RGBA"))
