@@ -11,13 +11,13 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from splatgraft.core.gaussians import KnownSurface
 from splatgraft.core.images import linear_from_srgb, srgb_from_linear
-from splatgraft.core.meshes import Mesh, Texture, unit
+from splatgraft.core.meshes import Mesh, Texture, area_vectors, unit
 from splatgraft.core.spherical_harmonics import dc_from_rgb
 
 DEFAULT_BUDGET = 60_000
@@ -49,79 +49,61 @@ def sample_mesh(mesh: Mesh, *, budget: int = DEFAULT_BUDGET, seed: int = 0) -> K
     Raises:
         ValueError: The mesh has no area.
     """
-    across = np.cross(mesh.corners[:, 1] - mesh.corners[:, 0], mesh.corners[:, 2] - mesh.corners[:, 0])
+    across = area_vectors(mesh.corners)
     area = 0.5 * np.linalg.norm(across, axis=1)
     size = float(np.ptp(mesh.corners.reshape(-1, 3), axis=0).max())
-    rows = (area > _DEGENERATE * size**2).nonzero()[0]
-    if not len(rows):
+    area[area <= _DEGENERATE * size**2] = 0  # no point is drawn there
+    if not area.any():
         raise ValueError("expected triangles with an area, found none")
-    inverted, is_open, is_edge = (found[rows] for found in _sides(mesh.corners))
-    # an open part appears twice, once with its triangles turned round
-    triangle = np.concatenate([rows, rows[is_open]])
-    sign = np.concatenate([np.where(inverted, -1.0, 1.0), np.full(int(is_open.sum()), -1.0)])
+    triangle, sign, is_open, is_edge = _sides(mesh.corners, size)
     rng = np.random.default_rng(seed)
     total = float(area[triangle].sum())
     which, weights = _drawn(area[triangle], _CANDIDATES * budget, rng)
+    corners = mesh.corners[triangle[which]]
     opposite = np.roll(weights, 1, axis=1)  # the weight of the corner opposite to each edge
-    distance = opposite * _heights(mesh.corners[triangle])[which]
-    near = (distance < _INSET * math.sqrt(total / budget)) & (opposite < _RIM)
-    inside = ~(np.concatenate([is_edge, is_edge[is_open]])[which] & near).any(1)
-    which, weights = which[inside], weights[inside]
+    heights = 2 * area[triangle[which], None] / np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    near = (opposite * heights < _INSET * math.sqrt(total / budget)) & (opposite < _RIM)
+    inside = (~(is_edge[which] & near).any(1)).nonzero()[0]
     facing = unit(across)[triangle[which]] * sign[which, None]
-    points = np.einsum("nc,nci->ni", weights, mesh.corners[triangle[which]])
-    kept = _spread(points, facing, radius=math.sqrt(_DENSITY * total / budget))[:budget]
+    points = np.einsum("nc,nci->ni", weights, corners)
+    radius = math.sqrt(_DENSITY * total / budget)
+    kept = inside[_spread(points[inside], facing[inside], radius=radius)[:budget]]
     which, weights, points, facing = which[kept], weights[kept], points[kept], facing[kept]
     spacing = math.sqrt(total / len(kept))
-    lifted = np.concatenate([is_open, np.ones(int(is_open.sum()), bool)])[which]
-    shift = np.where(lifted, _APART * spacing, -_insets(points, facing, _INSET * spacing))
+    shift = np.where(is_open[which], _APART * spacing, -_insets(points, facing, _INSET * spacing))
     points = points + shift[:, None] * facing
     return _gaussians(mesh, triangle[which], weights, (points, facing, sign[which]), spacing)
 
 
 def _sides(
-    corners: Float[np.ndarray, "t 3 3"],
-) -> tuple[Bool[np.ndarray, "t"], Bool[np.ndarray, "t"], Bool[np.ndarray, "t 3"]]:
-    """Find the triangles of closed parts that face inwards, those of open parts, and ends and sharp ridges as edges.
+    corners: Float[np.ndarray, "t 3 3"], size: float
+) -> tuple[Int[np.ndarray, "s"], Float[np.ndarray, "s"], Bool[np.ndarray, "s"], Bool[np.ndarray, "s 3"]]:
+    """Find the s sides of triangles that can be seen: the outside of closed parts, both sides of open ones.
 
     A part is closed if each of its edges is met as often in one direction as in the other. Edge i of a triangle begins
-    at corner i.
+    at corner i. Returns triangles, signs of their normals, whether their part is open, and their ends and sharp ridges.
     """
-    size = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
     grid = np.round(corners.reshape(-1, 3) / (1e-6 * size)).astype(np.int64)
-    _, vertex = np.unique(grid, axis=0, return_inverse=True)
-    vertex = vertex.reshape(-1, 3)
+    vertex = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1, 3)
     begin, end = vertex.ravel(), np.roll(vertex, -1, axis=1).ravel()
     count = int(vertex.max()) + 1
     _, label = connected_components(coo_array((np.ones(len(begin)), (begin, end)), (count, count)), directed=False)
     part = label[vertex[:, 0]]
-    key, direction = np.minimum(begin, end) * count + np.maximum(begin, end), np.sign(end - begin)
-    edge, first, at = np.unique(key, return_index=True, return_inverse=True)
-    unpaired = np.bincount(at, weights=direction, minlength=len(edge)) != 0
-    is_open = np.bincount(label[begin[first[unpaired]]], minlength=int(label.max()) + 1) > 0
+    edge = np.unique(np.minimum(begin, end) * count + np.maximum(begin, end), return_inverse=True)[1]
+    by_edge = csr_array((np.ones(len(edge)), (edge, np.arange(len(edge)))))  # sums values over each edge's triangles
+    is_unpaired = (np.asarray(by_edge @ np.sign(end - begin))[edge] != 0).reshape(-1, 3)
+    is_open = np.isin(part, part[is_unpaired.any(1)])
     centred = corners - corners.reshape(-1, 3).mean(0)
     volume = np.einsum("ti,ti->t", centred[:, 0], np.cross(centred[:, 1], centred[:, 2]))
-    inwards = np.bincount(part, weights=volume, minlength=len(is_open)) < 0
-    is_inverted = inwards[part] & ~is_open[part]
-    outward = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    middle, normal = (
-        values.repeat(3, axis=0) for values in (centred.mean(1), outward * np.where(is_inverted, -1, 1)[:, None])
-    )
-
-    def by_edge(values: Float[np.ndarray, "h"]) -> Float[np.ndarray, "e"]:
-        return np.bincount(at, weights=values, minlength=len(edge))
-
-    middles, normals = (np.stack([by_edge(v[:, i]) for i in range(3)], 1) for v in (middle, normal))
+    sign = np.where((np.bincount(part, weights=volume)[part] < 0) & ~is_open, -1.0, 1.0)
+    middle, normal = (v.repeat(3, axis=0) for v in (centred.mean(1), unit(area_vectors(corners)) * sign[:, None]))
+    middles, normals = by_edge @ middle, by_edge @ normal
     # on a ridge each of two triangles lies below the other's plane
-    below = (middles * normals).sum(1) < 2 * by_edge((middle * normal).sum(1))
-    is_sharp = np.linalg.norm(normals, axis=1) < _SHARP * by_edge(np.ones(len(at)))
-    return is_inverted, is_open[part], (unpaired | (is_sharp & below))[at].reshape(-1, 3)
-
-
-def _heights(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "t 3"]:
-    """Compute the heights of triangles over their edges."""
-    edges = np.roll(corners, -1, axis=1) - corners
-    double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1, keepdims=True)
-    return double_area / np.linalg.norm(edges, axis=2)
+    is_ridge = (middles * normals).sum(1) < 2 * (by_edge @ (middle * normal).sum(1))
+    is_sharp = np.linalg.norm(normals, axis=1) < _SHARP * by_edge.sum(1)
+    is_edge = is_unpaired | (is_ridge & is_sharp)[edge].reshape(-1, 3)
+    triangle = np.concatenate([np.arange(len(corners)), is_open.nonzero()[0]])
+    return triangle, np.append(sign, np.full(is_open.sum(), -1.0)), is_open[triangle], is_edge[triangle]
 
 
 def _insets(
@@ -176,48 +158,36 @@ def _gaussians(
 ) -> KnownSurface:
     points, facing, sign = placed
     n = len(points)
-    normals = unit(np.einsum("nc,nci->ni", weights, mesh.normals[triangle]))
-    normals = normals * np.where(np.einsum("ni,ni->n", normals, facing) < 0, -1, 1)[:, None]
-    uv = np.einsum("nc,nci->ni", weights, mesh.uv[triangle])
-    rgba = np.concatenate([np.einsum("nc,nci->ni", weights, mesh.colors[triangle]), np.ones((n, 1))], 1)
-    metallic, roughness, emission, is_there = np.empty(n), np.empty(n), np.zeros((n, 3)), np.ones(n, bool)
-    edges, uv_edges = (
-        (corners[:, 1:] - corners[:, :1]) for corners in (mesh.corners[triangle], mesh.uv[triangle].astype(np.float64))
+    normals, uv, colors = (
+        np.einsum("nc,nci->ni", weights, values[triangle]) for values in (mesh.normals, mesh.uv, mesh.colors)
     )
-    determinant = np.linalg.det(uv_edges)
-    uv_per_area = np.abs(determinant) / np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    normals = unit(normals) * np.where((normals * facing).sum(1) < 0, -1, 1)[:, None]
+    rgba = np.concatenate([colors, np.ones((n, 1))], 1)
+    metallic, roughness, emission, is_there = np.empty(n), np.empty(n), np.empty((n, 3)), np.empty(n, bool)
+    corners, uv_corners = mesh.corners[triangle], mesh.uv[triangle].astype(np.float64)
+    edges, uv_edges = corners[:, 1:] - corners[:, :1], uv_corners[:, 1:] - uv_corners[:, :1]
+    uv_per_area = np.abs(np.linalg.det(uv_edges)) / np.linalg.norm(area_vectors(corners), axis=1)
     footprint = uv_per_area * spacing**2
     for index, material in enumerate(mesh.materials):
         here = mesh.material[triangle] == index
         at = uv[here], footprint[here]
-        rgba[here] *= material.color
-        if material.color_map is not None:
-            rgba[here] *= _looked_up(material.color_map, *at, is_srgb=True)
+        rgba[here] *= material.color * _looked_up(material.color_map, *at, is_srgb=True)
         is_there[here] = rgba[here, 3] >= material.alpha_cutoff
-        surface = 1.0 if material.surface_map is None else _looked_up(material.surface_map, *at)
-        surface = np.broadcast_to(surface, (int(here.sum()), 4))
+        surface = _looked_up(material.surface_map, *at)
         metallic[here], roughness[here] = material.metallic * surface[:, 2], material.roughness * surface[:, 1]
-        glow = 1.0 if material.emission_map is None else _looked_up(material.emission_map, *at, is_srgb=True)[:, :3]
-        emission[here] = np.array(material.emission) * glow
+        emission[here] = material.emission * _looked_up(material.emission_map, *at, is_srgb=True)[:, :3]
         if material.normal_map is not None:
             bent = 2 * _looked_up(material.normal_map, *at)[:, :3] - 1
             bent[:, :2] *= material.normal_scale
             normals[here] = _bent(normals[here], bent, edges[here], uv_edges[here], sign[here])
     rotation = np.stack([1 + facing[:, 2], -facing[:, 1], facing[:, 0], np.zeros(n)], 1)
     rotation[facing[:, 2] < -0.999999] = (0, 1, 0, 0)
-    log_scales = np.log(spacing * np.array([_WIDTH, _WIDTH, _THICKNESS])).repeat(n).reshape(3, n).T
-    albedo = srgb_from_linear(torch.from_numpy(rgba[:, :3].clip(0, 1)).float())
-    fields = (points, log_scales, rotation / np.linalg.norm(rotation, axis=1, keepdims=True))
-    means, scales, quaternions = (torch.from_numpy(np.ascontiguousarray(field)).float() for field in fields)
-    known = (normals, metallic.clip(0, 1), roughness.clip(0, 1), emission)
-    return KnownSurface(
-        means,
-        scales,
-        quaternions,
-        torch.full((n,), _OPACITY).logit(),
-        dc_from_rgb(albedo)[:, None],
-        *(torch.from_numpy(values).float() for values in known),
-    ).select(torch.from_numpy(is_there))
+    log_scales = np.full((n, 3), np.log(spacing * np.array([_WIDTH, _WIDTH, _THICKNESS])))
+    fields = (points, log_scales, unit(rotation), normals, metallic.clip(0, 1), roughness.clip(0, 1), emission)
+    means, scales, quaternions, *known = (torch.tensor(values, dtype=torch.float32) for values in fields)
+    sh = dc_from_rgb(srgb_from_linear(torch.tensor(rgba[:, :3].clip(0, 1), dtype=torch.float32)))[:, None]
+    surface = KnownSurface(means, scales, quaternions, torch.full((n,), _OPACITY).logit(), sh, *known)
+    return surface.select(torch.from_numpy(is_there))
 
 
 def _bent(
@@ -228,34 +198,29 @@ def _bent(
     sign: Float[np.ndarray, "n"],
 ) -> Float[np.ndarray, "n 3"]:
     """Turn normals by a normal map's values, whose axes are along u, against v, and outwards."""
-    determinant = np.linalg.det(uv_edges)
-    scale = np.where(determinant == 0, 0.0, 1 / np.where(determinant == 0, 1, determinant))[:, None]
-    along = scale * (uv_edges[:, 1, 1:] * edges[:, 0] - uv_edges[:, 0, 1:] * edges[:, 1])
-    against = scale * (uv_edges[:, 1, :1] * edges[:, 0] - uv_edges[:, 0, :1] * edges[:, 1])
-    tangents = (unit(axis - np.einsum("ni,ni->n", axis, normals)[:, None] * normals) for axis in (along, against))
-    tangent, bitangent = tangents
+    turn = np.sign(np.linalg.det(uv_edges))[:, None]
+    along = turn * (uv_edges[:, 1, 1:] * edges[:, 0] - uv_edges[:, 0, 1:] * edges[:, 1])
+    against = turn * (uv_edges[:, 1, :1] * edges[:, 0] - uv_edges[:, 0, :1] * edges[:, 1])
+    tangent, bitangent = (unit(axis - (axis * normals).sum(1)[:, None] * normals) for axis in (along, against))
     # on the back of a sheet the same relief is seen from behind
     lifted = sign[:, None] * (bent[:, :1] * tangent + bent[:, 1:2] * bitangent)
     return unit(lifted + np.maximum(bent[:, 2:], 0.1) * normals)
 
 
 def _looked_up(
-    texture: Texture, uv: Float[np.ndarray, "n 2"], footprint: Float[np.ndarray, "n"], *, is_srgb: bool = False
+    texture: Texture | None, uv: Float[np.ndarray, "n 2"], footprint: Float[np.ndarray, "n"], *, is_srgb: bool = False
 ) -> Float[np.ndarray, "n 4"]:
-    """Average a texture over an area around each point; linear values in [0, 1].
+    """Average a texture over an area of uv around each point; linear values in [0, 1], 1 for None.
 
-    Args:
-        texture: The image.
-        uv: Texture coordinates of n points.
-        footprint: Area of each average, squares of texture coordinates.
-        is_srgb: Whether its colours are sRGB; alpha never is.
+    With `is_srgb`, the colours are decoded; alpha is linear.
     """
+    if texture is None:
+        return np.ones((len(uv), 4))
     matrix = texture.image_from_uv
     at = uv @ matrix[:, :2].T + matrix[:, 2]
     for axis, wrap in enumerate(texture.wrap):
         values = at[:, axis]
-        folded = 1 - np.abs(values % 2 - 1)
-        at[:, axis] = {"repeat": values % 1, "mirror": folded, "clamp": values.clip(0, 1)}[wrap]
+        at[:, axis] = {"repeat": values % 1, "mirror": 1 - np.abs(values % 2 - 1), "clamp": values.clip(0, 1)}[wrap]
     image = torch.from_numpy(texture.pixels.astype(np.float32) / 255)
     if is_srgb:
         image[..., :3] = linear_from_srgb(image[..., :3])
