@@ -11,8 +11,8 @@ from splatgraft.core.posed_images import PosedImages
 from splatgraft.formats.captures import read_capture_file
 from splatgraft.formats.captures.transforms_json import write_cameras, write_capture
 from splatgraft.formats.captures.views import ViewRecord, cameras, posed_images
-from splatgraft.formats.meshes import has_known_surface as file_has_known_surface
-from splatgraft.formats.meshes import read_gltf, read_ply, read_polygon_file
+from splatgraft.formats.meshes import SUFFIXES as MESH_SUFFIXES
+from splatgraft.formats.meshes import has_known_surface, read_surface
 from splatgraft.formats.parsing import parsing
 from splatgraft.formats.scenes.axes import with_axes
 from splatgraft.formats.scenes.compressed_ply import COMPRESSED_PLY, write_compressed_ply
@@ -54,13 +54,6 @@ _READERS: dict[str, Callable[[Path], SceneFile]] = {
     ".sog": read_sog,
     ".ksplat": read_ksplat,
 }
-_MESH_READERS = {
-    ".ply": read_ply,
-    ".glb": read_gltf,
-    ".gltf": read_gltf,
-    ".obj": read_polygon_file,
-    ".stl": read_polygon_file,
-}
 _WRITERS = {
     ".ply": write_gaussian_ply,
     COMPRESSED_PLY: write_compressed_ply,
@@ -70,7 +63,7 @@ _WRITERS = {
     ".glb": write_gaussian_glb,
 }
 
-SCENE_SUFFIXES = (*_READERS, *_MESH_READERS)
+SCENE_SUFFIXES = (*_READERS, *MESH_SUFFIXES)
 """Suffixes of trained scenes and meshes that can be read; a folder of SOG images has none."""
 
 WRITTEN_SCENE_SUFFIXES = tuple(_WRITERS)
@@ -81,12 +74,6 @@ def is_scene(path: Path) -> bool:
     """Whether the suffix is that of a trained scene or a mesh, or the path is a folder of SOG images or its
     meta.json."""
     return path.suffix.lower() in SCENE_SUFFIXES or is_sog_folder(path)
-
-
-def has_known_surface(path: Path) -> bool:
-    """Whether a scene's file is a mesh, or Gaussians whose normals and materials are known."""
-    with parsing(path):
-        return path.is_file() and file_has_known_surface(path)
 
 
 def scene_files(path: Path) -> tuple[Path, ...]:
@@ -123,7 +110,7 @@ def read_scene(path: Path | str, *, axes: str | None = None, mesh_budget: int = 
 
 def _read(path: Path, mesh_budget: int = DEFAULT_BUDGET) -> SceneFile:
     with parsing(path):
-        meshes = {suffix: partial(read, budget=mesh_budget) for suffix, read in _MESH_READERS.items()}
+        meshes = dict.fromkeys(MESH_SUFFIXES, partial(read_surface, budget=mesh_budget))
         read = read_sog if is_sog_folder(path) else _by_suffix(path, _READERS | meshes)
         if not path.exists():
             raise ValueError("expected a trained scene, found none")

@@ -3,47 +3,42 @@
 from pathlib import Path
 
 from splatgraft.core.mesh_sampling import sample_mesh
-from splatgraft.core.meshes import Mesh
 from splatgraft.formats import gltf
 from splatgraft.formats.meshes.gltf_mesh import read_gltf_mesh
 from splatgraft.formats.meshes.polygon_files import AXES, is_polygon_ply, read_polygons
+from splatgraft.formats.parsing import parsing
 from splatgraft.formats.scenes import ply
 from splatgraft.formats.scenes.gaussian_glb import has_gaussians, read_gaussian_glb
 from splatgraft.formats.scenes.gaussian_ply import SURFACE, read_gaussian_ply
 from splatgraft.formats.scenes.scene_file import SceneFile, SceneMetadata
 
+SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".stl")
+"""Suffixes of meshes; a .ply or .glb may hold Gaussians instead."""
+_GLTF = (".glb", ".gltf")
 _UP = (0.0, -1.0, 0.0)  # of a mesh, in the axes RDF
 
 
-def read_ply(path: Path, budget: int) -> SceneFile:
-    """Read a .ply of Gaussians, or of a mesh with at most `budget` Gaussians."""
-    return read_polygon_file(path, budget) if is_polygon_ply(path) else read_gaussian_ply(path)
-
-
-def read_gltf(path: Path, budget: int) -> SceneFile:
-    """Read a .glb or .gltf of Gaussians, or of a mesh with at most `budget` Gaussians."""
-    found = gltf.read_gltf(path)
-    if has_gaussians(found):
-        return read_gaussian_glb(found)
-    mesh, notes = read_gltf_mesh(found, path)
-    return _covered(mesh, budget, gltf.AXES, SceneMetadata(_UP, 1.0), notes)  # glTF's unit is the metre
-
-
-def read_polygon_file(path: Path, budget: int) -> SceneFile:
-    """Read a mesh of an .obj, .stl or .ply with at most `budget` Gaussians."""
-    mesh, notes = read_polygons(path)
-    return _covered(mesh, budget, AXES[path.suffix.lower()], SceneMetadata(_UP), notes)
+def read_surface(path: Path, budget: int) -> SceneFile:
+    """Read a mesh with at most `budget` Gaussians, or the Gaussians of a .ply or .glb."""
+    suffix = path.suffix.lower()
+    if suffix in _GLTF:
+        found = gltf.read_gltf(path)
+        if has_gaussians(found):
+            return read_gaussian_glb(found)
+        (mesh, notes), axes, metadata = read_gltf_mesh(found, path), gltf.AXES, SceneMetadata(_UP, 1.0)  # in metres
+    elif suffix == ".ply" and not is_polygon_ply(path):
+        return read_gaussian_ply(path)
+    else:
+        (mesh, notes), axes, metadata = read_polygons(path), AXES[suffix], SceneMetadata(_UP)
+    said = f"a mesh of {len(mesh.corners):,} triangles, covered by Gaussians"
+    return SceneFile(sample_mesh(mesh, budget=budget), axes, metadata, (said, *notes))
 
 
 def has_known_surface(path: Path) -> bool:
-    """Whether a scene's file is a mesh, or a .ply of Gaussians whose normals and materials are known."""
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        vertex = ply.read_header(path).element("vertex")
-        return is_polygon_ply(path) or (vertex is not None and set(SURFACE) <= set(vertex.types))
-    return suffix in (".obj", ".stl") or (suffix in (".glb", ".gltf") and not has_gaussians(gltf.read_gltf(path)))
-
-
-def _covered(mesh: Mesh, budget: int, axes: str, metadata: SceneMetadata, notes: tuple[str, ...]) -> SceneFile:
-    said = f"a mesh of {len(mesh.corners):,} triangles, covered by Gaussians"
-    return SceneFile(sample_mesh(mesh, budget=budget), axes, metadata, (said, *notes))
+    """Whether a scene's file is a mesh, or Gaussians whose normals and materials are known."""
+    with parsing(path):
+        suffix = path.suffix.lower() if path.is_file() else ""
+        if suffix == ".ply":
+            vertex = ply.read_header(path).element("vertex")
+            return is_polygon_ply(path) or (vertex is not None and set(SURFACE) <= set(vertex.types))
+        return suffix in SUFFIXES and not (suffix in _GLTF and has_gaussians(gltf.read_gltf(path)))
