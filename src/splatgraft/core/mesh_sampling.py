@@ -138,14 +138,12 @@ def _spread(points: Float[np.ndarray, "c 3"], facing: Float[np.ndarray, "c 3"], 
     # query_pairs lists the earlier point first
     is_kept, is_left = np.zeros(len(points), bool), np.ones(len(points), bool)
     while is_left.any():
-        waits = np.zeros(len(points), bool)
-        waits[pairs[:, 1]] = True
-        chosen = is_left & ~waits
+        chosen = is_left.copy()
+        chosen[pairs[:, 1]] = False
         is_kept |= chosen
-        excluded = pairs[chosen[pairs[:, 0]], 1]
         is_left &= ~chosen
-        is_left[excluded] = False
-        pairs = pairs[is_left[pairs[:, 0]] & is_left[pairs[:, 1]]]
+        is_left[pairs[chosen[pairs[:, 0]], 1]] = False
+        pairs = pairs[is_left[pairs].all(1)]
     return is_kept.nonzero()[0]
 
 
