@@ -157,12 +157,12 @@ class Materials:
     """Linear rgb under the old light, without the lobe."""
     share: Float[Tensor, "n"]
     """Share of the lobe in the colour under the old light, in [0, 1]."""
+    emission: Float[Tensor, "n 3"]
+    """Emitted linear rgb."""
     facing: Float[Tensor, "n"] | None = None
     """Share of a dielectric's reflectance at normal incidence; None for `_FACING`."""
     roughness: Float[Tensor, "n"] | None = None
     """Perceptual roughness of GGX surfaces, which reflect sources; None for lobes that were fitted to views."""
-    emission: Float[Tensor, "n 3"] | None = None
-    """Emitted linear rgb; None for none."""
 
     def select(self, rows: slice | Int[Tensor, "m"]) -> "Materials":
         """Select the materials of m Gaussians."""
@@ -176,8 +176,7 @@ class Materials:
     @property
     def glossy(self) -> Bool[Tensor, "n"]:
         """Whether each Gaussian has a lobe, or emits light."""
-        lobes = (self.reflectance > 0).any(1)
-        return lobes if self.emission is None else lobes | (self.emission > 0).any(1)
+        return (self.reflectance > 0).any(1) | (self.emission > 0).any(1)
 
     @property
     def mirrors(self) -> Bool[Tensor, "n"]:
@@ -204,9 +203,9 @@ def known_materials(surface: KnownSurface) -> Materials:
         dielectric=surface.metallic <= 0.5,
         matt=(1 - metal) * (1 - mean) * albedo,
         share=torch.zeros(surface.count),
+        emission=surface.emission,
         facing=_FACING / grazing,
         roughness=surface.roughness,
-        emission=surface.emission,
     )
 
 
@@ -232,6 +231,7 @@ def estimate_materials(
         dielectric=torch.zeros(n, dtype=torch.bool),
         matt=base,
         share=torch.zeros(n),
+        emission=torch.zeros(n, 3),
     )
     if gaussians.sh_degree == 0 or not views:
         return matt
@@ -434,9 +434,7 @@ def gloss_bands(
         # views from behind the surface take the reflection of their mirror image in front
         in_front = views + (towards - towards.abs())[..., None] * facing
         lobe = lobe_radiance(materials, rows, light, normals, in_front)
-        linear = (materials.matt[rows] * shade[rows])[:, None] + lobe
-        if materials.emission is not None:
-            linear = linear + materials.emission[rows][:, None]
+        linear = (materials.matt[rows] * shade[rows])[:, None] + lobe + materials.emission[rows][:, None]
         srgb = srgb_from_linear(linear.clamp(0, _BRIGHTEST))
         if materials.roughness is None:
             bands = torch.einsum("vk,nvc->nkc", project, srgb - 0.5)
