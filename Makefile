@@ -1,5 +1,5 @@
 # make install: the package in .venv; make demo: a whole transfer on shipped captures;
-# make dev: also what the checks need; make test: all checks but the long ones, 9 minutes on two idle cores;
+# make dev: also what the checks need; make test: all checks but the long ones, 9 to 12 minutes on two idle cores;
 # make test-all: the long ones too, and shapes checked at every call; make test-fast: pytest alone without a browser;
 # make blender: Blender 4.2 as a Python module in .venv-blender, for `splatgraft paper synth --blender-python`, and
 # Blender 5.3 in .venv-blender5, for the tests of the add-on; make extension: the add-on as an extension with its index;
