@@ -128,7 +128,7 @@ class SceneShadowMaps:
         found = away.norm(dim=1) < self.region.radius
         if self.source_maps is not None:
             for direction in self.source_maps.window.directions:
-                found |= torch.linalg.cross(away, direction[None]).norm(dim=1) < self.region.radius
+                found |= _from_axis(away, direction) < self.region.radius
         return found
 
 
@@ -150,7 +150,7 @@ def scene_shadow_maps(
     in_beam = near.clone()
     for direction, length in zip(sources.directions, umbra_lengths(sources, radius), strict=True):
         along = -(away @ direction)
-        in_beam |= (along > 0) & (along < length) & (torch.linalg.cross(away, direction[None]).norm(dim=1) < reach)
+        in_beam |= (along > 0) & (along < length) & (_from_axis(away, direction) < reach)
     parts = ((sources, _SOURCE_SIZE, in_beam), (samples.of_ambient, _AMBIENT_SIZE, near))
     for part, size, is_blocker in parts:
         blockers = scene.select(is_blocker)
@@ -311,13 +311,18 @@ def reachable(
     parts = zip(sources.directions, sources.softness, sources.distances, lengths, strict=True)
     for direction, softness, light_distance, length in parts:
         along = -(away @ direction)
-        aside = (distance**2 - along**2).clamp_min(0).sqrt()
+        aside = _from_axis(away, direction)
         spread = torch.tan(softness.clamp_max(1.2)) * (along + sphere.radius).clamp_min(0)
         # the shadow of a near light widens with the distance
         wider = 1 + along.clamp_min(0) / (light_distance - sphere.radius).clamp_min(0.5 * sphere.radius)
         in_cone = (along + rims > -sphere.radius) & (aside - rims < wider * (sphere.radius + spread))
         reached |= in_cone & (inside | (along - rims < length))
     return reached
+
+
+def _from_axis(away: Float[Tensor, "m 3"], direction: Float[Tensor, "3"]) -> Float[Tensor, "m"]:
+    """Compute the distance of points from the line through the origin along a unit direction."""
+    return torch.linalg.cross(away, direction[None]).norm(dim=1)
 
 
 def umbra_lengths(sources: LightSamples, radius: float) -> Float[Tensor, "k"]:
