@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import cache
+from unittest.mock import MagicMock
 
 import pytest
 import torch
@@ -25,6 +26,7 @@ from splatgraft.relighting import (
     light_from_json,
     light_to_json,
     relight,
+    transfer,
 )
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.cast_shadows import SHADOW_POWER, cast_shadows
@@ -438,3 +440,13 @@ def test_between_two_given_lights_the_level_changes_in_full(factor):
     shade = relit.shade[relit.is_object]
     # both irradiances come from the same samples; float32
     assert torch.allclose(shade, torch.full_like(shade, factor), rtol=1e-3)
+
+
+def test_copies_of_an_object_share_the_light_at_its_old_place(monkeypatch):
+    found = MagicMock(side_effect=transfer.find_source_light)
+    monkeypatch.setattr(transfer, "find_source_light", found)
+    one, other = ball(0.2, 200), ball(0.3, 200)
+    source = SourceScene(empty(), cameras(), light=Light((), SKY))
+    objects = [(thing, at(x, 0.0, 0.3)) for thing, x in ((one, -1.0), (other, 0.0), (one, 1.0))]
+    relight(placed(*objects), cameras(), sources=[source] * 3, light=Light((), SKY), options=WHOLE)
+    assert found.call_count == 2

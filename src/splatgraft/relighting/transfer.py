@@ -28,11 +28,18 @@ from splatgraft.relighting.layers import Relit, assemble_layers, pasted
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.light.sun import Point
-from splatgraft.relighting.prepared_object import PreparedObject, SourceScene, find_source_light, prepare_object
+from splatgraft.relighting.prepared_object import (
+    PreparedObject,
+    SourceLight,
+    SourceScene,
+    find_source_light,
+    prepare_object,
+)
 from splatgraft.relighting.scene_light import SceneLight, find_scene_light
 from splatgraft.runtime.memo import Memo
 
-_SOURCE_LIGHT = "source light"  # name in the memo
+_Captured = tuple[Gaussians, SourceScene | None]
+"""An object and the scene that it was taken from."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +107,8 @@ class TransferValues:
     def __init__(self, clock: Callable[[], ClockSun | None]) -> None:
         """Start without values; `clock` reads the sun by the clock of the target's photos."""
         self._memo, self._clock = Memo(), clock
+        self._source_lights: dict[tuple[int, int], tuple[_Captured, SourceLight]] = {}
+        """Light at each object's old place, by the identities of the object and its source scene."""
 
     def is_moved(self, composite: Composite, cameras: Cameras, light: Light | None, options: RelightOptions) -> bool:
         """Return whether objects were moved since the light of the scene was found."""
@@ -119,6 +128,8 @@ class TransferValues:
         """Transfer the light as `relight` does; unless `exact`, keep the sources found before a short move."""
         pairs = enumerate(zip(composite.objects, sources, strict=True), 1)
         placed = [(number, one, source) for number, (one, source) in pairs if one.gaussians.count]
+        used = {_identity((one.gaussians, source)) for _, one, source in placed}
+        self._source_lights = {key: known for key, known in self._source_lights.items() if key in used}
         if not placed:
             return pasted(composite, "No object is placed: nothing to light.")
         scene = self._scene_light(composite, cameras, light, options, exact=exact)
@@ -140,9 +151,9 @@ class TransferValues:
             other: The values that may hold the light.
             theirs: The same object and source scene there.
         """
-        light = other._memo.peek(_SOURCE_LIGHT, theirs)
-        if light is not None:
-            self._memo.put(_SOURCE_LIGHT, pair, light)
+        known = other._source_lights.get(_identity(theirs))
+        if known is not None:
+            self._source_lights[_identity(pair)] = (pair, known[1])
 
     def _scene_light(
         self, composite: Composite, cameras: Cameras, light: Light | None, options: RelightOptions, *, exact: bool
@@ -180,15 +191,20 @@ class TransferValues:
             if moved is not None:
                 return moved
         pair = (placed.gaussians, source)
-        if source is None:
-            source_light = find_source_light(*pair)
-        else:  # shared by copies of one object, which were captured in one light
-            source_light = self._memo.get(_SOURCE_LIGHT, pair, lambda: find_source_light(*pair))
+        key = _identity(pair)
+        if key not in self._source_lights:  # copies of one object were captured in one light
+            self._source_lights[key] = (pair, find_source_light(*pair))
+        source_light = self._source_lights[key][1]
         prepared = prepare_object(
             placed, source, scene.captured.cameras, source_light=source_light, light=scene.light, number=number
         )
         self._memo.put(name, inputs, prepared)
         return prepared
+
+
+def _identity(pair: _Captured) -> tuple[int, int]:
+    """Return the identities of both; a copy of the same object has the same."""
+    return id(pair[0]), id(pair[1])
 
 
 def _poses(composite: Composite) -> bytes:
