@@ -11,8 +11,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from splatgraft.capture.colmap_process.job import MAX_ERROR_PX, MIN_TRACK, PHASES, Job
@@ -163,14 +165,14 @@ def _without_astray(model: dict[str, Any], photos: Path) -> dict[str, Any]:
         names=tuple(image["name"] for image in images),
     )
     past, index = past_subject(cameras), {name: i for i, name in enumerate(cameras.names)}
+    if not bool(past.any()):
+        return model
     agreed = torch.zeros(len(images), len(images))  # matches of two photos, positive if most agree with their poses
     for a, b, matches, share in model["agreements"]:
         agreed[index[a], index[b]] = agreed[index[b], index[a]] = matches * (share - _AGREED)
-    group = ((agreed > 0) | torch.eye(len(images), dtype=torch.bool))[past][:, past].float()
-    for _ in images:
-        group = (group @ group).clamp_max(1)
-    against = group @ agreed[past][:, ~past].sum(1) < 0
-    astray = {cameras.names[i] for i in past.nonzero()[:, 0][against].tolist()}
+    _, group = connected_components(agreed[past][:, past].clamp_min(0).numpy(), directed=False)
+    with_others = np.bincount(group, weights=agreed[past][:, ~past].sum(1).numpy())
+    astray = {cameras.names[i] for i in past.nonzero()[:, 0][with_others[group] < 0].tolist()}
     return {
         **model,
         "images": [image for image in model["images"] if image["name"] not in astray],

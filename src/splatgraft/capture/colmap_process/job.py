@@ -52,7 +52,7 @@ class Job:
 
     @property
     def output(self) -> Path:
-        """File of the best model; files of an earlier version had another name and other values."""
+        """File of the best model."""
         return self.folder / "model.json"
 
 
