@@ -112,7 +112,11 @@ class Panel:
         return None if held is None or pointer.what in ("down", "cancel") else held.at(pointer.place)
 
     def surface_under(self, pointer: Pointer, view: View, scene: Gaussians) -> tuple[Float[Tensor, 3], Ray]:
-        """Return the point of a scene's surface under the pointer, and the ray; raise ValueError if there is none."""
+        """Return the point of a scene's surface under the pointer, and the ray through it.
+
+        Raises:
+            ValueError: No surface is under the pointer.
+        """
         ray = Ray.through(pointer.place, self.camera(view))
         hit = first_surface_hit(scene, ray.origin, ray.direction)
         if hit is None:
