@@ -172,7 +172,7 @@ def _without_astray(model: dict[str, Any], photos: Path) -> dict[str, Any]:
         agreed[index[a], index[b]] = agreed[index[b], index[a]] = matches * (share - _AGREED)
     _, group = connected_components(agreed[past][:, past].clamp_min(0).numpy(), directed=False)
     with_others = np.bincount(group, weights=agreed[past][:, ~past].sum(1).numpy())
-    astray = {cameras.names[i] for i in past.nonzero()[:, 0][with_others[group] < 0].tolist()}
+    astray = {cameras.names[i] for i, g in zip(past.nonzero()[:, 0].tolist(), group, strict=True) if with_others[g] < 0}
     return {
         **model,
         "images": [image for image in model["images"] if image["name"] not in astray],
