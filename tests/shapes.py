@@ -3,11 +3,13 @@
 import math
 from collections.abc import Callable
 from dataclasses import fields
+from datetime import UTC, datetime
 
 import torch
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras, look_at, pinhole
+from splatgraft.core.clock_sun import ClockSun, SunCandidate
 from splatgraft.core.directions import even_directions, frames_along
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import srgb_from_linear
@@ -135,3 +137,10 @@ def _lit_scene(light_at: Callable[[Tensor], Tensor], strength: float) -> Gaussia
     keep = (point[:, None, :2] - centers[:, :2]).norm(dim=-1).min(1).values > 0.05
     keep |= point[:, 2] > 0.01
     return surfels(point[keep], normal[keep], width=0.03, srgb=srgb_from_linear(gray)[keep, None].repeat(1, 3))
+
+
+def clock_at(*directions: Tensor, error_deg: float = 5.0) -> ClockSun:
+    """Return the sun by a clock with these candidates."""
+    noon = datetime(2026, 6, 1, 12, tzinfo=UTC)
+    candidates = [SunCandidate(noon, "GPS", 30.0, tuple(one.tolist())) for one in directions]
+    return ClockSun(tuple(candidates), (0.0, 0.0, 1.0), error_deg, "a compass", None)

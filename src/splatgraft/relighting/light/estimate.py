@@ -4,8 +4,8 @@
 2. Find the radiance of 320 directions that explains it (`radiance_search.py`).
 3. Turn peaks of that radiance into sources, and the rest into ambient light of degree 2.
 4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it. Otherwise replace them by the
-   sun of the photos' clock. Without a clock, the brightest source is the sun out of doors, if no camera saw it. Both
-   move to the shadows and take the strength that these show, or that of `known_sun.py`.
+   sun that is known from the photos' clock or, out of doors, from a clear sky or as the brightest source that no camera
+   saw (`known_sun.py`). It moves to the shadows and takes the strength that these show, or else the most probable one.
 5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
 """
 
@@ -24,7 +24,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import LUMINANCE
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.evidence import find_highlights, find_shading_evidence
-from splatgraft.relighting.light.known_sun import BY_CLOCK, direction_by_clock, sun_towards
+from splatgraft.relighting.light.known_sun import known_sun, sun_towards
 from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
@@ -156,17 +156,12 @@ def estimate_light(
     main = next(iter(sources), None)
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
     if sun is None:
-        known, name = direction_by_clock(captured.clock, main), BY_CLOCK
-        if (
-            known is None
-            and main is not None
-            and main.name in _UNSEEN_NAMES
-            and _is_outdoors(evidence.far, captured.up)
-        ):
-            known, name = (torch.tensor(main.direction), main.uncertainty_deg), "sun"
+        is_unseen = main is not None and main.name in _UNSEEN_NAMES
+        outdoors = _is_outdoors(evidence.far, captured.up)
+        known = known_sun(captured, main, outdoors=outdoors, is_unseen=is_unseen)
         if known is not None:
-            shown = sun_near(*known, whole, region, name=name)
-            sun = sun_towards(shown, problem, evidence, rest) if shown.ratio is None else shown
+            shown = sun_near(known.log_prior, whole, region, name=known.name)
+            sun = shown if shown.ratio is not None else sun_towards(shown, known.is_clear, problem, evidence, rest)
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, place)
     return found if sun is None else found.with_sun(sun, scene)

@@ -1,7 +1,10 @@
-"""The sun where it is known that there is one: by the clock of the photos, or as the brightest source out of doors.
+"""The sun where it is known that there is one: by the clock of the photos, or out of doors.
 
-The clock knows where the sun stands, not whether clouds or walls hide it. So the sun's strength, its irradiance on
-level ground over that of all other light, has a posterior:
+Out of doors the sun is known by a clear sky, whose brightness shows where it stands (`sky.py`), or as the brightest
+source that no camera saw.
+
+Clouds or walls may still hide the sun. So the sun's strength, its irradiance on level ground over that of
+all other light, has a posterior:
 
 - The likelihood is that of the shading and the highlights (`radiance_model.py`), for one source over the light that the
   estimate has beside its sources.
@@ -10,17 +13,19 @@ level ground over that of all other light, has a posterior:
 """
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.clock_sun import ClockSun, clock_directions
+from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import DIRECTIONS
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceProblem
-from splatgraft.relighting.light.sun import ERROR_DEG, LOWEST_SINE, Sun
+from splatgraft.relighting.light.sky import SkyEvidence
+from splatgraft.relighting.light.sun import ERROR_DEG, FINE_DIRECTIONS, LOWEST_SINE, LogPrior, Sun, prior_near
 
 # a clear sky, fitted by benchmarks/fit_sky.py
 _CLEAR = 11.2  # strength of the sun over the sine of its height
@@ -28,7 +33,9 @@ _CLEAR_SD = 0.26  # standard deviation of the logarithm of that
 _TINT = (1.34, 0.97, 0.58)  # strength in red, green and blue over that in luminance
 
 # set by hand
-_IS_CLEAR = 0.5  # prior probability of a clear sky
+_IS_CLEAR, _MOST_CLEAR = 0.5, 0.9  # probability of a clear sky if the views do not show it, and its maximum
+_AS_LIKELY = 3.0  # log likelihood of a clear sky at which it is as likely as not
+_SHADING_IS_WRONG = 0.3  # probability that the brightest source is not the sun, beside a clear sky
 _STRENGTHS = torch.logspace(-2, 1.4, 35, dtype=torch.float64)
 _LEAST = 0.1  # strength below which the sun is hidden
 _SUN_RADIUS_DEG = 0.27
@@ -37,6 +44,18 @@ _ROUNDS = 8  # iterations of reweighting
 
 BY_CLOCK = "sun by the photos' clock"
 """Name in reports."""
+
+
+@dataclass(frozen=True)
+class KnownSun:
+    """A sun that exists unless clouds or walls hide it."""
+
+    log_prior: LogPrior
+    """Log density of its direction."""
+    name: str
+    """Name in reports."""
+    is_clear: float = _IS_CLEAR
+    """Probability of a clear sky."""
 
 
 def direction_by_clock(clock: ClockSun | None, main: LightSource | None) -> tuple[Float[Tensor, "3"], float] | None:
@@ -50,11 +69,47 @@ def direction_by_clock(clock: ClockSun | None, main: LightSource | None) -> tupl
     return _joined(directions[0], clock.error_deg, main) if clock is not None and len(directions) else None
 
 
-def sun_towards(sun: Sun, problem: RadianceProblem, evidence: LightEvidence, rest: Float[Tensor, "k 3"]) -> Sun | None:
+def known_sun(captured: CapturedScene, main: LightSource | None, *, outdoors: bool, is_unseen: bool) -> KnownSun | None:
+    """Find out whether there is a sun unless something hides it, and where it may stand.
+
+    Args:
+        captured: The scene.
+        main: Brightest estimated source.
+        outdoors: Whether the scene is out of doors.
+        is_unseen: Whether no camera saw `main`, so that it may be the sun.
+    """
+    by_clock = direction_by_clock(captured.clock, main)
+    if by_clock is not None:
+        return KnownSun(prior_near(by_clock[0][None], by_clock[1]), BY_CLOCK)
+    if not outdoors:
+        return None
+    sky, above = SkyEvidence.of(captured), FINE_DIRECTIONS[FINE_DIRECTIONS @ captured.up > LOWEST_SINE]
+    is_clear = float((sky.log_likelihoods(above).max() - _AS_LIKELY).sigmoid())
+    if is_clear < _IS_CLEAR:
+        return KnownSun(_prior_by_shading(main, wrong=0.0), "sun") if main is not None and is_unseen else None
+    by_shading = _prior_by_shading(main if is_unseen else None, wrong=_SHADING_IS_WRONG)
+
+    def log_prior(directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
+        return sky.log_likelihoods(directions) + by_shading(directions)
+
+    return KnownSun(log_prior, "sun", min(is_clear, _MOST_CLEAR))
+
+
+def _prior_by_shading(source: LightSource | None, *, wrong: float) -> LogPrior:
+    """Return the log density of the sun's direction by an estimated source; uniform without one."""
+    if source is None:
+        return lambda directions: torch.zeros(len(directions))
+    return prior_near(torch.tensor([source.direction]), source.uncertainty_deg, wrong=wrong)
+
+
+def sun_towards(
+    sun: Sun, is_clear: float, problem: RadianceProblem, evidence: LightEvidence, rest: Float[Tensor, "k 3"]
+) -> Sun | None:
     """Estimate the strength of a sun in a known direction.
 
     Args:
         sun: The sun, without a ratio.
+        is_clear: Probability of a clear sky.
         problem: Density of the light at the place.
         evidence: Evidence that `problem` is made of.
         rest: Estimated radiance from all `DIRECTIONS` without the sources.
@@ -62,7 +117,7 @@ def sun_towards(sun: Sun, problem: RadianceProblem, evidence: LightEvidence, res
     Returns:
         The sun with its ratio; None if the evidence is against a sun there.
     """
-    log_posterior = _log_prior(float(sun.direction @ evidence.up))
+    log_posterior = _log_prior(float(sun.direction @ evidence.up), is_clear)
     log_posterior -= _costs(problem, evidence, rest, sun.direction) / problem.settings.temperature
     strength = float(_STRENGTHS[log_posterior.argmax()])
     if strength < _LEAST:
@@ -85,12 +140,12 @@ def _joined(
     return mean, sum(precisions) ** -0.5
 
 
-def _log_prior(sine: float) -> Float[Tensor, "r"]:
-    """Return the log prior of `_STRENGTHS` for a sun whose height has this sine."""
+def _log_prior(sine: float, is_clear: float) -> Float[Tensor, "r"]:
+    """Return the log prior of `_STRENGTHS` for a sun whose height has this sine, and a probability of a clear sky."""
     clear = _CLEAR * max(sine, LOWEST_SINE)
-    is_clear = torch.exp(-0.5 * ((_STRENGTHS / clear).log() / _CLEAR_SD) ** 2)
-    is_weaker = (clear >= _STRENGTHS).double()
-    return (_IS_CLEAR * is_clear / is_clear.sum() + (1 - _IS_CLEAR) * is_weaker / is_weaker.sum() + 1e-12).log()
+    of_clear = torch.exp(-0.5 * ((_STRENGTHS / clear).log() / _CLEAR_SD) ** 2)
+    weaker = (clear >= _STRENGTHS).double()
+    return (is_clear * of_clear / of_clear.sum() + (1 - is_clear) * weaker / weaker.sum() + 1e-12).log()
 
 
 def _costs(

@@ -53,7 +53,7 @@ _DARKEST = 2e-3  # mean linear radiance below which a place has no light
 
 # surroundings
 _MIN_ALPHA = 0.3  # alpha below which a direction was not captured
-_CLIPPED = 0.955  # sRGB of the brightest channel above which a photo may be clipped; reconstructed white is darker
+CLIPPED = 0.955  # sRGB of the brightest channel above which a photo may be clipped; reconstructed white is darker
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def surroundings_at(scene: Gaussians, cameras: Cameras, center: Float[Tensor, "3
     points = center + directions * panorama.distance.reshape(-1, 1).clamp(0, FARTHEST)
     known = _photographed(points, cameras) & (panorama.alpha.flatten() > _MIN_ALPHA)
     radiance = panorama.radiance.reshape(-1, 3)
-    clipped = known & (radiance.max(1).values > float(linear_from_srgb(torch.tensor(_CLIPPED))))
+    clipped = known & (radiance.max(1).values > float(linear_from_srgb(torch.tensor(CLIPPED))))
     seen = known * panorama.alpha.flatten().clamp(0, 1)
     nearest_direction = nearest_directions(directions)
     total = _sum(angles, nearest_direction).clamp_min(1e-9)

@@ -72,6 +72,9 @@ _PROMISING = 10.0  # log likelihood over that of even light above which a direct
 _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
 _SURFACES = 2  # level surfaces whose shadows move a sun: a table, and the ground around it
 _STEP_DEG = 2.5  # of the grids of directions around a given one
+FINE_DIRECTIONS = even_directions(6400)
+"""Unit directions 2.5 degrees apart."""
+_IMPROBABLE = 4.5  # difference of log densities to the most probable direction, as at 3 standard errors
 _WIDER = 3.0  # radius of the second region: few things stand near a small object, but the sun is the same
 _TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a prior, because texels share their errors
 _CLOCK_IS_WRONG = 0.05  # probability that no candidate of the clock is the sun
@@ -474,22 +477,14 @@ def _lamp_near(sun: Sun, shown: _ShadowEvidence) -> Sun | None:
     return None if measured is None else replace(measured, distance=height / float(direction @ measured.normal))
 
 
-def sun_near(
-    direction: Float[Tensor, "3"],
-    error_deg: float,
-    captured: CapturedScene,
-    region: BoundingSphere,
-    *,
-    name: str = "",
-) -> Sun:
+def sun_near(log_prior: LogPrior, captured: CapturedScene, region: BoundingSphere, *, name: str = "") -> Sun:
     """Find the sun near a direction, when it is known that there is one.
 
-    The density of its direction is normal around the given one, times the likelihoods of the shadows on each level
-    surface in the wider region. So shadows that alone prove no sun still show where it is.
+    The density of its direction is the prior times the likelihoods of the shadows on each level surface in the wider
+    region. So shadows that alone prove no sun still show where it is.
 
     Args:
-        direction: Unit vector towards the sun.
-        error_deg: Standard error of `direction`, degrees.
+        log_prior: Log density of the sun's direction without these shadows.
         captured: The scene with all objects that cast shadows during the capture.
         region: Sphere around the place.
         name: Name in reports.
@@ -499,24 +494,24 @@ def sun_near(
         its shadow.
     """
     surfaces = _ShadowEvidence.on_surfaces(captured, replace(region, radius=_WIDER * region.radius), most=_SURFACES)
-    near = _around(direction, 3 * error_deg, _STEP_DEG)
-    near = near[near @ direction > math.cos(math.radians(3 * error_deg))]
+    near = FINE_DIRECTIONS[FINE_DIRECTIONS @ captured.up > LOWEST_SINE]
     for one in surfaces:
         near = one.above(near)
-    unmeasured = Sun(direction, UNSEEN_RADIUS_DEG, captured.up, None, 0.0, error_deg, name)
-    if not surfaces or not len(near):
-        return unmeasured
-    away_deg = torch.rad2deg((near @ direction).clamp(-1, 1).acos())
-    log_density = sum((one.log_likelihoods(near) for one in surfaces), -0.5 * (away_deg / error_deg).square())
+    log_density = log_prior(near)
+    probable = log_density > log_density.max() - _IMPROBABLE
+    near = near[probable]
+    log_density = sum((one.log_likelihoods(near) for one in surfaces), log_density[probable])
     weights = log_density.softmax(0)
     mean = F.normalize(weights @ near, dim=0)
     variance = weights @ torch.rad2deg((near @ mean).clamp(-1, 1).acos()).square() / 2  # of two axes
-    moved = replace(unmeasured, direction=mean, error_deg=max(float(variance.sqrt()), ERROR_DEG))
-    evidence, shown = max(((float(one.log_likelihoods(mean[None])), one) for one in surfaces), key=itemgetter(0))
-    if evidence < _LIKELIER:
+    error_deg = max(float(variance.sqrt()), ERROR_DEG)
+    moved = Sun(mean, UNSEEN_RADIUS_DEG, captured.up, None, 0.0, error_deg, name)
+    shadows = [(float(one.log_likelihoods(mean[None])), one) for one in surfaces]
+    evidence, shown = max(shadows, key=itemgetter(0), default=(0.0, None))
+    if shown is None or evidence < _LIKELIER:
         return moved
     measured = _measured(shown, mean, evidence)
-    return moved if measured is None else replace(measured, error_deg=moved.error_deg, name=name)
+    return moved if measured is None else replace(measured, error_deg=error_deg, name=name)
 
 
 def _prior_by_clock(clock: ClockSun | None) -> LogPrior:
@@ -524,11 +519,12 @@ def _prior_by_clock(clock: ClockSun | None) -> LogPrior:
     towards = clock_directions(clock)
     if clock is None or not len(towards):
         return lambda directions: torch.zeros(len(directions))
-    return _prior_near(towards, max(clock.error_deg, ERROR_DEG), wrong=_CLOCK_IS_WRONG)
+    density = prior_near(towards, max(clock.error_deg, ERROR_DEG), wrong=_CLOCK_IS_WRONG)
+    return lambda directions: _TEMPERATURE * density(directions)
 
 
-def _prior_near(towards: Float[Tensor, "c 3"], error_deg: float, *, wrong: float) -> LogPrior:
-    """Return the log density over that of an even hemisphere, times `_TEMPERATURE`, if one of c directions is right.
+def prior_near(towards: Float[Tensor, "c 3"], error_deg: float, *, wrong: float = 0.0) -> LogPrior:
+    """Return the log density over that of an even hemisphere, if one of c directions is right.
 
     Args:
         towards: Unit directions of the same probability.
@@ -540,7 +536,7 @@ def _prior_near(towards: Float[Tensor, "c 3"], error_deg: float, *, wrong: float
     def log_prior(directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
         away = (directions @ towards.T).clamp(-1, 1).acos() / error
         density = torch.exp(-0.5 * away.square()).mean(1) / error**2
-        return _TEMPERATURE * ((1 - wrong) * density + wrong).log()
+        return ((1 - wrong) * density + wrong).log()
 
     return log_prior
 
@@ -566,7 +562,8 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
         near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, 2 * _BY_HAND_DEG, _STEP_DEG))
         if shown is None or not len(near):
             continue
-        found, evidence, _ = shown.best(near, _prior_near(direction[None], _BY_HAND_DEG, wrong=0.0))
+        log_prior = prior_near(direction[None], _BY_HAND_DEG, wrong=0.0)
+        found, evidence, _ = shown.best(near, lambda these, log_prior=log_prior: _TEMPERATURE * log_prior(these))
         measured = _measured(shown, found, math.inf) if evidence > _PROMISING else None
         if measured is not None:
             return replace(measured, name=SET_BY_HAND)

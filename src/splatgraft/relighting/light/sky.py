@@ -1,0 +1,115 @@
+"""Direction of the sun from the brightness of a clear sky that the views of a capture show.
+
+A clear sky is brighter around the sun and towards the horizon. The models are the five clear skies of CIE S 011:2003
+(types 11 to 15); how bright the sky is as a whole is unknown. Views also show other things above the horizon, such as
+trees, so each direction shows either the sky or something of any brightness.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from splatgraft.core.directions import even_directions
+from splatgraft.core.images import LUMINANCE, linear_from_srgb
+from splatgraft.relighting.captured_scene import CapturedScene
+from splatgraft.relighting.light.panorama import CLIPPED
+
+_SKIES = (  # CIE S 011: a and b of the gradation from zenith to horizon, c, d and e of the indicatrix around the sun
+    (-1.0, -0.55, 10.0, -3.0, 0.45),
+    (-1.0, -0.32, 10.0, -3.0, 0.45),
+    (-1.0, -0.32, 16.0, -3.0, 0.30),
+    (-1.0, -0.15, 16.0, -3.0, 0.30),
+    (-1.0, -0.15, 24.0, -2.8, 0.15),
+)
+
+# set by hand
+_LOWEST_SINE = math.sin(math.radians(2.0))  # of the height of a direction that may show the sky
+_CELLS = even_directions(1600)  # directions into which pixels are sorted, 5 degrees apart
+_EVERY, _FEWEST = 3, 4  # stride of the pixels, and fewest pixels of a cell
+_SD = 0.2  # standard deviation of the logarithm of a sky's luminance
+_IS_SKY = 0.75  # prior probability that a cell shows the sky
+_ANY = 0.2  # density of the logarithm of the luminance of other things
+_TEMPERATURE = 8.0  # divisor of log likelihoods, because neighbouring cells share their errors
+_BRIGHTNESS = torch.arange(-5.0, 5.0, 0.1)  # logarithm of luminance over that of a sky of unit brightness
+_SKY_BRIGHTNESS = _BRIGHTNESS[20:-20:2]  # brightness of the sky as a whole, over the median of what is seen
+
+
+@dataclass(frozen=True)
+class SkyEvidence:
+    """Brightness that the views show above the horizon, in b cells."""
+
+    directions: Float[Tensor, "b 3"]
+    """Unit vectors to the middles of the cells, scene's frame."""
+    log_luminance: Float[Tensor, "b"]
+    """Logarithm of linear luminance, median over the pixels."""
+    clipped: Bool[Tensor, "b"]
+    """Whether the cell is clipped, so that it may be brighter."""
+    sines: Float[Tensor, "b"]
+    """Sines of the cells' heights above the horizon."""
+
+    @staticmethod
+    def of(captured: CapturedScene) -> "SkyEvidence":
+        """Collect what the views of a capture show above the horizon."""
+        tree, cells, colors = KDTree(_CELLS.numpy()), [], []
+        for camera, drawn in captured.views:
+            rays = torch.nn.functional.normalize(camera.world_rays()[::_EVERY, ::_EVERY], dim=-1)
+            shown = (rays @ captured.up > _LOWEST_SINE) & (drawn.alpha[0, ::_EVERY, ::_EVERY] > 0.9)
+            cells.append(torch.from_numpy(tree.query(rays[shown].numpy())[1]))
+            colors.append(drawn.color[0, ::_EVERY, ::_EVERY][shown].clamp(0, 1))
+        cell, color = torch.cat(cells), torch.cat(colors)
+        log_luminance = (linear_from_srgb(color) @ LUMINANCE).clamp_min(1e-3).log()
+        order = log_luminance.argsort()
+        order = order[cell[order].argsort(stable=True)]
+        counts = cell.unique(return_counts=True)[1]
+        middle = order[counts.cumsum(0) - (counts + 1) // 2][counts >= _FEWEST]
+        directions = _CELLS[cell[middle]]
+        sines = (directions @ captured.up).clamp_min(_LOWEST_SINE)
+        return SkyEvidence(directions, log_luminance[middle], color[middle].amax(1) > CLIPPED, sines)
+
+    def log_likelihoods(self, suns: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
+        """Compute the log likelihood of clear skies with the sun in k unit directions.
+
+        It is over the likelihood of cells whose brightness does not depend on their direction, and over `_TEMPERATURE`.
+        """
+        if not len(self.directions):
+            return torch.zeros(len(suns))
+        cosines = (suns @ self.directions.T).clamp(-1, 1)
+        found = torch.stack([self._under(sky, cosines) for sky in _SKIES]).amax(0)
+        return (found - self._without_sky()) / _TEMPERATURE
+
+    def _under(self, sky: tuple[float, ...], cosines: Float[Tensor, "k b"]) -> Float[Tensor, "k"]:
+        """Compute the log likelihood under a type of sky, each at its best brightness.
+
+        Args:
+            sky: Numbers of the CIE's model.
+            cosines: Of the angles between k suns and the cells.
+        """
+        a, b, c, d, e = sky
+        gradation = 1 + a * (b / self.sines).exp()
+        around = 1 + c * ((d * cosines.acos()).exp() - math.exp(d * math.pi / 2)) + e * cosines.square()
+        off = self.log_luminance - self.log_luminance.median() - (gradation * around).log()
+        # the likelihood depends on the histogram of these differences alone
+        step, count = float(_BRIGHTNESS[1] - _BRIGHTNESS[0]), len(_BRIGHTNESS)
+        position = ((off - _BRIGHTNESS[0]) / step).round().long().clamp(0, count - 1)
+        position += torch.arange(len(off))[:, None] * count
+        z = (_BRIGHTNESS[:, None] - _SKY_BRIGHTNESS) / _SD
+        density = (-0.5 * z.square()).exp() / (_SD * math.sqrt(2 * math.pi))
+        log_density = (_IS_SKY * density + (1 - _IS_SKY) * _ANY).log()
+        log_share_brighter = (_IS_SKY * 0.5 * torch.erfc(z / math.sqrt(2)) + (1 - _IS_SKY) * 0.5).log()
+        total = torch.zeros(len(off), len(_SKY_BRIGHTNESS))
+        for which, table in ((~self.clipped, log_density), (self.clipped, log_share_brighter)):
+            histogram = position[:, which].flatten().bincount(minlength=len(off) * count).reshape(-1, count)
+            total += histogram.float() @ table
+        return total.amax(1)
+
+    def _without_sky(self) -> float:
+        """Compute the log likelihood if the brightness of a cell is like that of any other cell."""
+        seen, share = self.log_luminance[~self.clipped], self.clipped.float().mean()
+        density = (-0.5 * ((seen[:, None] - seen) / _SD).square()).exp() / (_SD * math.sqrt(2 * math.pi))
+        others = (density.sum(1) - density.diagonal()) / max(len(seen) - 1, 1)
+        log_density = (_IS_SKY * others + (1 - _IS_SKY) * _ANY).log().sum()
+        return float(log_density + self.clipped.sum() * (_IS_SKY * share + (1 - _IS_SKY) * 0.5).log())

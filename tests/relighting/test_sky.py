@@ -1,0 +1,115 @@
+"""The sun by the brightness of a clear sky, on skies of another model (Preetham et al. 1999)."""
+
+import math
+
+import pytest
+import torch
+from shapes import clock_at, ring, surfels
+from torch import Tensor
+
+from splatgraft.core.directions import even_directions
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import srgb_from_linear
+from splatgraft.relighting.captured_scene import CapturedScene
+from splatgraft.relighting.light.known_sun import BY_CLOCK, known_sun
+from splatgraft.relighting.light.light import LightSource
+from splatgraft.relighting.light.sky import SkyEvidence
+
+SUN = torch.tensor([math.cos(math.radians(40)), 0.0, math.sin(math.radians(40))])
+ABOVE = even_directions(1600)[even_directions(1600)[:, 2] > 0.05]
+
+
+def preetham(directions: Tensor, sun: Tensor, turbidity: float) -> Tensor:
+    """Relative luminance of a clear sky, Preetham et al. 1999, appendix A.2."""
+    t = turbidity
+    a, b, c = 0.1787 * t - 1.4630, -0.3554 * t + 0.4275, -0.0227 * t + 5.3251
+    d, e = 0.1206 * t - 2.5771, -0.0670 * t + 0.3703
+    cosine = directions @ sun
+    around = 1 + c * torch.exp(d * cosine.clamp(-1, 1).acos()) + e * cosine.square()
+    return (1 + a * torch.exp(b / directions[:, 2].clamp_min(0.02))) * around
+
+
+def dome(luminance: Tensor, directions: Tensor) -> Gaussians:
+    """A sphere around the cameras with this linear luminance in each direction, grey ground below the horizon."""
+    linear = torch.where(directions[:, 2] > 0, luminance, 0.1).clamp(0, 1)
+    colors = srgb_from_linear(linear[:, None].expand(-1, 3).contiguous())
+    return surfels(30 * directions, -directions, srgb=colors, width=0.6)
+
+
+def captured(luminance: Tensor, directions: Tensor) -> CapturedScene:
+    return CapturedScene(dome(luminance, directions), ring(height=1.0, radius=2.0, focal=50.0))
+
+
+def azimuth_deg(direction: Tensor) -> float:
+    return math.degrees(math.atan2(float(direction[1]), float(direction[0])))
+
+
+@pytest.mark.parametrize("turbidity", [2.0, 4.0])
+@pytest.mark.parametrize("turn", [0.0, 130.0])
+def test_a_clear_sky_shows_where_the_sun_is_although_trees_hide_a_third_of_it(turbidity, turn):
+    cosine, sine = math.cos(math.radians(turn)), math.sin(math.radians(turn))
+    sun = torch.tensor([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ SUN
+    directions = even_directions(12000)
+    luminance = preetham(directions, sun, turbidity)
+    luminance = 0.3 * luminance / luminance[directions[:, 2] > 0].median()
+    trees = torch.sin(7 * torch.atan2(directions[:, 1], directions[:, 0]) + 1) > 0.5
+    noise = torch.randn(len(directions), generator=torch.Generator().manual_seed(0))
+    luminance = torch.where(trees & (directions[:, 2] < 0.3), 0.05 * noise.exp(), luminance)
+    likelihoods = SkyEvidence.of(captured(luminance, directions)).log_likelihoods(ABOVE)
+    best = ABOVE[likelihoods.argmax()]
+    off = (azimuth_deg(best) - azimuth_deg(sun) + 180) % 360 - 180
+    assert abs(off) < 10  # two cells
+    assert float(likelihoods.max()) > 3  # the bar of known_sun
+    near = (sun @ ABOVE.T) > math.cos(math.radians(8))
+    assert float(likelihoods.max() - likelihoods[near].max()) < 2  # the right height is not ruled out
+
+
+def test_skies_and_walls_whose_brightness_says_nothing_of_a_sun_are_not_clear_skies():
+    directions = even_directions(12000)
+    noise = torch.randn(len(directions), generator=torch.Generator().manual_seed(1))
+    overcast = 0.3 * (1 + 2 * directions[:, 2]) / 3
+    even = torch.full((len(directions),), 0.4)
+    sides = (4 * torch.atan2(directions[:, 1], directions[:, 0]) / math.pi).floor()
+    walls = torch.tensor([0.1, 0.5, 0.05, 0.3, 0.8, 0.15, 0.6, 0.2])[sides.long() % 8]
+    for luminance in (overcast, even, walls, 0.2 * noise.exp()):
+        assert float(SkyEvidence.of(captured(luminance, directions)).log_likelihoods(ABOVE).max()) < 3
+
+
+def test_a_view_without_sky_says_nothing():
+    directions = even_directions(12000)
+    scene = dome(torch.ones(len(directions)), directions).select(directions[:, 2] < 0)
+    evidence = SkyEvidence.of(CapturedScene(scene, ring(height=1.0, radius=2.0, focal=50.0)))
+    assert len(evidence.directions) == 0
+    assert evidence.log_likelihoods(ABOVE).tolist() == [0.0] * len(ABOVE)
+
+
+def test_the_sun_is_known_by_the_clock_then_by_the_sky_then_by_the_brightest_source():
+    directions = even_directions(12000)
+    clear = captured(preetham(directions, SUN, 3.0) * 0.02, directions)
+    grey = captured(torch.full((len(directions),), 0.4), directions)
+    aside = torch.tensor([0.0, math.cos(0.7), math.sin(0.7)])
+    main = LightSource((0.0, math.cos(0.7), math.sin(0.7)), (1.0, 1.0, 1.0), uncertainty_deg=6.0)
+
+    def likeliest(scene: CapturedScene, *, is_unseen: bool = True, outdoors: bool = True) -> Tensor | None:
+        known = known_sun(scene, main, outdoors=outdoors, is_unseen=is_unseen)
+        return None if known is None else ABOVE[known.log_prior(ABOVE).argmax()]
+
+    for is_unseen in (True, False):  # a source that contradicts the sky is not followed
+        found = likeliest(clear, is_unseen=is_unseen)
+        assert found is not None
+        assert abs(azimuth_deg(found)) < 12
+    found = likeliest(grey)
+    assert found is not None
+    assert float(found @ aside) > math.cos(math.radians(4))
+    assert likeliest(grey, is_unseen=False) is None
+    assert likeliest(clear, outdoors=False) is None
+    by_clock = torch.tensor([0.0, 0.6, 0.8])
+    known = known_sun(
+        CapturedScene(clear.gaussians, clear.cameras, clock_at(by_clock)), None, outdoors=False, is_unseen=False
+    )
+    assert known is not None
+    assert known.name == BY_CLOCK
+    assert float(ABOVE[known.log_prior(ABOVE).argmax()] @ by_clock) > math.cos(math.radians(4))
+    sky = known_sun(clear, None, outdoors=True, is_unseen=False)
+    assert sky is not None
+    assert sky.is_clear > known.is_clear
