@@ -14,18 +14,21 @@ import threading
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import uvicorn
 from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from splatgraft.editor.access import allowed_query, cookie_name, why_refused
+from splatgraft.editor.access import cookie_name, why_refused
 from splatgraft.runtime.files import atomic_write
+
+if TYPE_CHECKING:
+    from splatgraft.editor.editor import Editor
 
 FILES_PREFIX = "files/"
 """Prefix of the addresses of the project's files, relative to the page."""
@@ -52,29 +55,6 @@ _ATTACHED_SECONDS = 0.05  # pause between looks for a client, while the project 
 _NOT_OURS = (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError)
 """Errors that an invalid message can raise."""
 _START_SECONDS = 60  # limit against a hang
-
-
-class Client(Protocol):
-    """Receiver of the events of windows, implemented by `Editor`."""
-
-    def opened(self, window: "Window") -> None:
-        """Handle a new window."""
-
-    def received(self, window: "Window", message: dict[str, Any]) -> None:
-        """Handle a window's message; raise ValueError, KeyError or TypeError if it is invalid."""
-
-    def closed(self, window: "Window") -> None:
-        """Handle a closed window."""
-
-    def file(self, name: str) -> Path | None:
-        """Return the file to serve for a name; None if it does not exist."""
-
-    def upload_path(self, name: str) -> Path:
-        """Return the path for an uploaded file; raise ValueError if its name is invalid."""
-        ...
-
-    def uploaded(self, path: Path, use: str) -> None:
-        """Handle a file uploaded for the control `use`."""
 
 
 class Window:
@@ -114,7 +94,7 @@ class Server:
     def __init__(self, token: str, *, host: str, port: int) -> None:
         """Start to listen at `port` or the next free one; each request must carry the token."""
         self._token = token
-        self._client: Client | None = None
+        self._client: Editor | None = None
         self._windows: list[Window] = []
         self._numbers = itertools.count(1)
         self._uploads = asyncio.Semaphore(_MAX_UPLOADS)
@@ -138,7 +118,7 @@ class Server:
         )
         self._thread.start()
 
-    def attach(self, client: Client) -> None:
+    def attach(self, client: "Editor") -> None:
         """Send events of windows to a client from now on; what open windows have sent so far has waited for it."""
         with self._lock:
             self._client = client
@@ -156,9 +136,6 @@ class Server:
         name = _ASSETS.get(request.path_params["name"])
         if name is None:
             return _no_file()
-        allowed = allowed_query(f"/?{request.url.query}")
-        if allowed is not None:
-            return RedirectResponse(allowed, 302)
         content = resources.files("splatgraft.editor").joinpath("static", name).read_bytes()
         response = Response(content, media_type=_TYPES[Path(name).suffix])
         cookie = f"{cookie_name(request.headers['Host'])}={self._token}; HttpOnly; SameSite=Strict; Path=/"
@@ -233,7 +210,7 @@ class Server:
                     self._client.closed(window)
 
 
-def _pass_on(client: Client, window: Window, event: Any) -> None:
+def _pass_on(client: "Editor", window: Window, event: Any) -> None:
     """Pass a window's message on, or report that it is invalid."""
     if event["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(event.get("code", 1000))
@@ -252,21 +229,7 @@ class _Guard:
         self._app, self._token = app, token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] not in ("http", "websocket"):
-            await self._app(scope, receive, send)
-            return
-        # repeated headers are joined, because the result matches no accepted value
-        headers: dict[str, str] = {}
-        for raw, value in scope["headers"]:
-            name, text = raw.decode("latin-1").title(), value.decode("latin-1")
-            headers[name] = text if name not in headers else headers[name] + ("; " if name == "Cookie" else ", ") + text
-        if scope["type"] == "websocket":
-            headers["Upgrade"] = "websocket"
-        path = f"{scope['path']}?{scope['query_string'].decode('latin-1')}"
-        refused = why_refused(self._token, headers, path)
-        if refused is not None and scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": 1008, "reason": refused})  # the client receives status 403
-            return
+        refused = why_refused(self._token, HTTPConnection(scope))
         if refused is not None:
             await _refusal(refused, 403)(scope, receive, send)
             return
