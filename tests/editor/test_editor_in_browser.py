@@ -9,7 +9,7 @@ from editor_pages import TOKEN, opened_editor
 from waiting import wait_until
 
 from splatgraft.editor.editor import Editor
-from splatgraft.editor.state_files import read_state
+from splatgraft.editor.state import read_state
 from splatgraft.project.toml_edit import with_keys
 
 

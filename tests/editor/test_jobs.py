@@ -6,13 +6,15 @@ import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from small_transfer import write_transfer
 from waiting import HANG_LIMIT, wait_until
 
 from splatgraft.cli import main
-from splatgraft.editor import job_process, sharing
+from splatgraft.editor import jobs as editor_jobs
+from splatgraft.editor import sharing
 from splatgraft.editor.jobs import Jobs, JobState, seconds_left, seconds_left_in_job, write_state
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
@@ -22,25 +24,27 @@ from splatgraft.project.step_table import PlannedStep
 WORK = """
 import sys, os, signal, time
 from pathlib import Path
-from splatgraft.editor.jobs import JobState, acquire_job_lock, write_state
+from splatgraft.editor.jobs import JobState, write_state
+from splatgraft.project.step import locked
 folder, release = Path(sys.argv[1]), Path(sys.argv[1]) / "release"
 signal.signal(signal.SIGINT, signal.default_int_handler)
-lock = acquire_job_lock(folder)
-state = JobState("work", ("run",), os.getpid(), "running", time.time(), step="render", done=3, total=4)
-write_state(folder, state)
-try:
-    while not release.exists():
-        time.sleep(0.05)
-    write_state(folder, JobState("work", ("run",), os.getpid(), "done", time.time()))
-except KeyboardInterrupt:
-    write_state(folder, JobState("work", ("run",), os.getpid(), "cancelled", time.time()))
+with locked(folder / "job"):
+    state = JobState("work", ("run",), os.getpid(), "running", step="render", done=3, total=4)
+    write_state(folder, state)
+    try:
+        while not release.exists():
+            time.sleep(0.05)
+        write_state(folder, JobState("work", ("run",), os.getpid(), "done"))
+    except KeyboardInterrupt:
+        write_state(folder, JobState("work", ("run",), os.getpid(), "cancelled"))
 """
 
 
 def start(folder: Path) -> Jobs:
     """Start a job that works until the file `release` exists."""
     jobs = Jobs(folder)
-    jobs.start([sys.executable, "-c", WORK, str(folder)], title="work", shown=["run"])
+    with patch.object(editor_jobs, "_PROGRAM", (sys.executable, "-c", WORK)):
+        jobs.start(["run"], "work")
     return jobs
 
 
@@ -59,7 +63,7 @@ def test_another_process_sees_a_job_at_work_and_its_end(tmp_path: Path) -> None:
     assert state is not None
     assert state.fraction == 0.75
     with pytest.raises(ValueError, match="running"):
-        other.start(["true"], title="another", shown=[])
+        other.start(["run"], "another")
     (tmp_path / "release").touch()
     ends(jobs, "done")
 
@@ -80,14 +84,14 @@ def test_cancelled_and_killed_jobs_have_that_outcome(tmp_path: Path) -> None:
 
 
 def test_the_remaining_time_is_measured_or_not_said() -> None:
-    state = JobState("work", (), 1, "running", 0.0, done=3, total=9, begun_at=100.0)
+    state = JobState("work", (), 1, "running", done=3, total=9, begun_at=100.0)
     assert seconds_left(state, 106.0) == 12.0
     assert seconds_left(state, 100.5) is None
-    assert seconds_left(JobState("work", (), 1, "running", 0.0), 100.0) is None
+    assert seconds_left(JobState("work", (), 1, "running"), 100.0) is None
     # units of an earlier run do not count for the speed
     assert seconds_left(replace(state, done=60, total=100, begun=50), 120.0) == 80.0
     plan = (PlannedStep("a", 10.0, True), PlannedStep("b", 4.0, True), PlannedStep("c", 6.0, True))
-    state = JobState("work", (), 1, "running", 0.0, step="a", step_started=100.0, plan=plan)
+    state = JobState("work", (), 1, "running", step="a", step_started=100.0, plan=plan)
     assert seconds_left_in_job(state, 103.0) == 7.0 + 4.0 + 6.0
     # the rate of the running step counts if it is slower than in the last run
     assert seconds_left_in_job(replace(state, done=1, total=4, begun_at=100.0), 105.0) == 15.0 + 4.0 + 6.0
@@ -110,15 +114,16 @@ def test_the_remaining_time_is_measured_or_not_said() -> None:
 
 
 def test_a_state_is_read_back_as_written_and_a_damaged_one_does_not_prevent_another_job(tmp_path: Path) -> None:
-    state = JobState("work", ("run",), os.getpid(), "done", 0.0, plan=(PlannedStep("a", 1.5, True),))
+    state = JobState("work", ("run",), os.getpid(), "done", plan=(PlannedStep("a", 1.5, True),))
     write_state(tmp_path, state)
     jobs = Jobs(tmp_path)
     assert jobs.state() == state
-    for text in ("{", "7", '{"pid": 0}', json.dumps(JobState("a", (), 0, "running", 0.0).__dict__)):
+    for text in ("{", "7", '{"pid": 0}', json.dumps(JobState("a", (), 0, "running").__dict__)):
         (tmp_path / "job.json").write_text(text)
         assert jobs.state() is None
     # a process that ends without a message counts as killed
-    jobs.start(["true"], title="next", shown=())
+    with patch.object(editor_jobs, "_PROGRAM", ("true",)):
+        jobs.start([], "next")
     state = jobs.state()
     assert state is not None
     assert (state.title, state.outcome) == ("next", "killed")
@@ -143,7 +148,7 @@ def written(session: Session, kind: str, part: str) -> tuple[Path, JobState]:
     session.jobs.folder.mkdir(parents=True, exist_ok=True)
     words = session.project.export_words(to, page=shared.page, layer=layer)
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    status = job_process.main([str(session.jobs.folder), "Write it", *words])
+    status = editor_jobs.main([str(session.jobs.folder), "Write it", *words])
     for number, handler in zip((signal.SIGINT, signal.SIGTERM), handlers, strict=True):
         signal.signal(number, handler)
     job = session.jobs.state()

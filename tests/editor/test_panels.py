@@ -19,7 +19,7 @@ from splatgraft.editor.light_process import Lit
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import RelitPreview
 from splatgraft.editor.session import Session
-from splatgraft.editor.state_files import read_state
+from splatgraft.editor.state import read_state
 from splatgraft.project.metric_scale import MetricScale, read_scale, write_scale
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LayerWeights

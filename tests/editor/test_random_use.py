@@ -9,7 +9,7 @@ import pytest
 import torch
 from editor_pages import Client, opened_editor
 
-from splatgraft.editor.state_files import read_state
+from splatgraft.editor.state import read_state
 from splatgraft.project.toml_edit import with_keys
 
 ACTIONS = 300

@@ -34,8 +34,7 @@ from splatgraft.editor.select_panel import SelectPanel
 from splatgraft.editor.server import Server, Window
 from splatgraft.editor.session import Session
 from splatgraft.editor.sharing import served_file, written_exports
-from splatgraft.editor.state import EditState
-from splatgraft.editor.state_files import Stamps, stamps_of
+from splatgraft.editor.state import EditState, Stamps, stamps_of
 from splatgraft.editor.stream import Stream, View
 from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.project.layout import Side
@@ -172,7 +171,7 @@ class Editor:
     def run(self, to: str, title: str) -> None:
         """Start a job that runs the stale steps up to `to`."""
         session = self.require_session()
-        session.start_job(session.project.run_words(to), title)
+        session.jobs.start(session.project.run_words(to), title)
         self.say(f"{title}: started; it continues if you close this page")
 
     # the panel and the status line

@@ -19,13 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatgraft.core.similarity import Similarity
 from splatgraft.editor.state import EditState
 from splatgraft.project.layout import EDITOR_FOLDER
-from splatgraft.project.placement import ObjectPlacement
+from splatgraft.project.placement import object_from_json, object_to_json
 from splatgraft.project.prompts import prompts_from_json, prompts_to_json
 from splatgraft.relighting import LayerWeights, light_from_json, light_to_json
-from splatgraft.runtime.files import atomic_write, relative_name, writable
+from splatgraft.runtime.files import atomic_write, writable
 
 _HISTORY_FILE, _STATES_FOLDER = "history.json", "states"
 _IN_MEMORY = 20
@@ -131,7 +130,7 @@ class StateStore:
 def _to_json(state: EditState, project_folder: Path) -> dict[str, Any]:
     """Convert a state to JSON's types, by field; None stays None."""
     convert: dict[str, Callable[[Any], Any]] = {
-        "objects": lambda objects: [_object_to_json(item, project_folder) for item in objects],
+        "objects": lambda objects: [object_to_json(item, project_folder) for item in objects],
         "erased": _packed,
         "corrections": _packed,
         "prompts": prompts_to_json,
@@ -143,7 +142,7 @@ def _to_json(state: EditState, project_folder: Path) -> dict[str, Any]:
 
 def _from_json(content: dict[str, Any], project_folder: Path) -> EditState:
     convert: dict[str, Callable[[Any], Any]] = {
-        "objects": lambda objects: tuple(_object_from_json(item, project_folder) for item in objects),
+        "objects": lambda objects: tuple(object_from_json(item, project_folder, "objects") for item in objects),
         "erased": partial(_unpacked, kind=np.bool_),
         "corrections": partial(_unpacked, kind=np.int8),
         "box": tuple,
@@ -158,19 +157,6 @@ def _converted(values: dict[str, Any], convert: Mapping[str, Callable[[Any], Any
     return {
         name: value if value is None or name not in convert else convert[name](value) for name, value in values.items()
     }
-
-
-def _object_to_json(item: ObjectPlacement, project_folder: Path) -> dict[str, Any]:
-    move = item.target_from_object
-    path = None if item.object_path is None else relative_name(item.object_path, project_folder)
-    rotation, translation = move.rotation.tolist(), move.translation.tolist()
-    return {"scale": move.scale, "rotation": rotation, "translation": translation, "object": path}
-
-
-def _object_from_json(fields: dict[str, Any], project_folder: Path) -> ObjectPlacement:
-    rotation, translation = (torch.tensor(fields[name]) for name in ("rotation", "translation"))
-    placement = Similarity(scale=fields["scale"], rotation=rotation, translation=translation)
-    return ObjectPlacement(placement, None if fields["object"] is None else project_folder / fields["object"])
 
 
 def _packed(flags: Tensor) -> str:

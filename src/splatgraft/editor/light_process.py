@@ -20,8 +20,7 @@ import torch
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import Draft, RelitPreview
 from splatgraft.editor.scene_cache import SceneCache
-from splatgraft.editor.state import EditState
-from splatgraft.editor.state_files import stamps_of
+from splatgraft.editor.state import EditState, stamps_of
 from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.relighting import Relit
 

@@ -1,6 +1,5 @@
 """The edited project: its files by project.toml, the stale steps, and the commands that run them."""
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,7 +11,6 @@ from splatgraft.exports.export import Layer
 from splatgraft.formats import is_scene
 from splatgraft.project.layout import (
     CAMERAS_FILE,
-    EDITOR_FOLDER,
     PLACEMENT_FILE,
     SCENE_FILE,
     SELECTION_FILE,
@@ -184,10 +182,6 @@ class Project:
         """Return the arguments of `splatgraft` that write the result or a part of it in the suffix's format."""
         part = ("--page", page) if page == "report" else () if layer == "all" else ("--layer", layer)
         return ("export", str(self.root), "--to", str(to), *part)
-
-    def job_command(self, words: tuple[str, ...], title: str) -> tuple[str, ...]:
-        """Return the command line of the child process that runs these arguments as a job."""
-        return (sys.executable, "-m", "splatgraft.editor.job_process", str(self.root / EDITOR_FOLDER), title, *words)
 
 
 def _rendered_views(capture: Capture) -> RenderedViews:

@@ -118,7 +118,7 @@ class SharePanel(Panel):
     def _start(self) -> None:
         (to, words), session = self._wanted(), self.session
         to.parent.mkdir(parents=True, exist_ok=True)
-        session.start_job(words, f"Write {to.name}")
+        session.jobs.start(words, f"Write {to.name}")
         job = session.jobs.state()
         self._asked = 0 if job is None else job.pid
         self.editor.say(f"{to.name}: being written; you can go on meanwhile")

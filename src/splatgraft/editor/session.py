@@ -18,8 +18,15 @@ from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.placement import ObjectSize, PlaceableObject
 from splatgraft.editor.project import PROBLEM, Project, ProjectFiles, RenderedViews, in_words
 from splatgraft.editor.scene_cache import SceneCache
-from splatgraft.editor.state import EditState, check_height_cm, check_state
-from splatgraft.editor.state_files import as_written, read_state, stamps_of, write_state
+from splatgraft.editor.state import (
+    EditState,
+    as_written,
+    check_height_cm,
+    check_state,
+    read_state,
+    stamps_of,
+    write_state,
+)
 from splatgraft.project.layout import EDITOR_FOLDER, Side
 from splatgraft.project.metric_scale import MetricScale, read_scale, write_scale
 from splatgraft.project.placement import ObjectPlacement
@@ -238,11 +245,7 @@ class Session:
         found = MetricScale(0.01 * cm / height, f"{by} height of {cm:g} cm")
         return write_scale(self.files.scene_and_cameras(side)[1], found)
 
-    # jobs
-
-    def start_job(self, words: tuple[str, ...], title: str) -> None:
-        """Start a child process that runs `splatgraft` with the given arguments."""
-        self.jobs.start(self.project.job_command(words, title), title=title, shown=words)
+    # stale steps
 
     def why_stale(self, *steps: str) -> str | None:
         """Return the original reason why one of these steps is out of date; None if all are up to date."""

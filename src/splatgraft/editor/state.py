@@ -1,21 +1,34 @@
-"""The edits of a project as an immutable value, and the limits of its numbers."""
+"""The edits of a project as an immutable value, its limits, and its files.
 
-from collections.abc import Iterable, Mapping, Sequence
+The files are project.toml, placement.json, erased.npy, corrections.npy, prompts.json and light.json.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import get_args
+from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Int8
 from torch import Tensor
 
 from splatgraft.core.prompts import ViewPrompt
-from splatgraft.folders.object_masks import MaskSource
-from splatgraft.harmonization import HARMONIZERS
-from splatgraft.project.placement import ObjectPlacement
+from splatgraft.project.gaussian_flags import read_corrections, write_flags
+from splatgraft.project.layout import ERASED_FILE, LIGHT_FILE, PLACEMENT_FILE
+from splatgraft.project.placement import ObjectPlacement, Placement, read_placement, write_placement
+from splatgraft.project.prompts import read_prompts, write_prompts
+from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
-from splatgraft.segmentation import Keep
+from splatgraft.runtime.files import atomic_write
+from splatgraft.runtime.settings import read_toml
+from splatgraft.steps.relight import Relight
+from splatgraft.steps.segment import Segment
+from splatgraft.workflow.flow import read_flow
 
 BoxNumbers = tuple[float, float, float, float, float, float]
+Stamps = tuple[tuple[int, int] | None, ...]
+"""Time and size of each file of the edits; None for a missing file."""
 
 _SCALES = (1e-6, 1e6)
 """Range of an object's scale; beyond it covariances leave the range of float32."""
@@ -23,10 +36,10 @@ _COORDINATES = (-1e6, 1e6)
 """World units; beyond, the resolution of float32 is coarser than about 0.1."""
 _HEIGHTS_CM = (1e-3, 1e7)
 """Heights that can be typed: from a hundredth of a millimetre to a hundred kilometres."""
-_WEIGHTS, _STOPS = (0.0, 100.0), (-16.0, 16.0)
-"""Weights of layers of the light transfer, and exposure and warmth in stops."""
-_ORTHONORMAL = 1e-3
-"""Largest deviation of a rotation from orthonormality: typed angles and float32 stay below 1e-6."""
+_CORRECTIONS_FILE, _PROMPTS_FILE = "corrections.npy", "prompts.json"
+_PLAIN_KEYS = ("mask_source", "keep", "box")  # of [segment], fields of the state of the same name
+_KEYS_OF_FILES = {"corrections": "corrections", "prompts": "prompts", "given_light": "light"}
+"""Keys of project.toml that name a file, with the field that it holds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,22 +74,20 @@ class EditState:
 
 
 def check_state(state: EditState) -> None:
-    """Check all values of a state, so that the project stays readable; raise ValueError in one line."""
+    """Check the numbers that a user types or drags, so that the project stays readable.
+
+    Raise ValueError in one line.
+    """
     for index, item in enumerate(state.objects or ()):
-        _check_placement(item, f"object {index + 1}")
+        where, move = f"{PLACEMENT_FILE}: object {index + 1}", item.target_from_object
+        _check_number(move.scale, f"{where}: scale", _SCALES)
+        check_numbers(move.translation.tolist(), f"{where}: position")
     if state.box is not None:
         check_numbers(state.box, "box")
         # in float32, as the box is used
         lower, upper = torch.tensor(state.box[:3]), torch.tensor(state.box[3:])
         if not bool((lower < upper).all()):
             raise ValueError(f"box: expected lower < upper, found {list(state.box[:3])} and {list(state.box[3:])}")
-    _check_choice(state.mask_source, get_args(MaskSource), "mask_source")
-    _check_choice(state.keep, get_args(Keep), "keep")
-    _check_choice(state.harmonizer, tuple(HARMONIZERS), "image model")
-    for name, value in asdict(state.weights).items():
-        _check_number(value, name, _STOPS if name in ("exposure", "warmth") else _WEIGHTS)
-    if state.light is not None:
-        light_from_json(light_to_json(state.light))
 
 
 def check_numbers(values: Iterable[float], where: str) -> None:
@@ -90,24 +101,100 @@ def check_height_cm(value: float) -> None:
     _check_number(value, "height in cm", _HEIGHTS_CM)
 
 
-def _check_placement(item: ObjectPlacement, where: str) -> None:
-    move = item.target_from_object
-    _check_number(move.scale, f"{where}: scale", _SCALES)
-    rotation = move.rotation.double()
-    error = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max())
-    # a comparison with NaN is false
-    if not (error < _ORTHONORMAL and float(torch.linalg.det(rotation)) > 0):
-        raise ValueError(f"{where}: expected a rotation, found {move.rotation.tolist()}")
-    for value in move.translation.tolist():
-        _check_number(value, f"{where}: position", _COORDINATES)
-
-
-def _check_choice(value: object, among: Sequence[str], name: str) -> None:
-    if value is not None and value not in among:
-        raise ValueError(f"{name}: expected one of {', '.join(among)}; found {value!r:.60}")
-
-
 def _check_number(value: float, where: str, bounds: tuple[float, float]) -> None:
     # NaN fails the comparison
     if not bounds[0] <= value <= bounds[1]:
         raise ValueError(f"{where}: expected a number from {bounds[0]:g} to {bounds[1]:g}, found {value!r:.60}")
+
+
+def read_state(project: Path) -> EditState:
+    """Read the state from project.toml and the files beside it; raise ValueError, in one line, for an invalid file."""
+    content, steps, placement = read_toml(project), read_flow(project).steps, project.parent / PLACEMENT_FILE
+    segment, relight = steps["segment"], steps["relight"]
+    assert isinstance(segment, Segment)
+    assert isinstance(relight, Relight)
+    values: dict[str, Any] = {key: getattr(segment, key) for key in _PLAIN_KEYS if key in content.get("segment", {})}
+    if placement.is_file():
+        found = read_placement(placement)
+        values |= {"objects": found.objects, "erased": found.erased}
+    state = EditState(
+        corrections=None if segment.corrections is None else read_corrections(segment.corrections),
+        prompts=None if segment.prompts is None else read_prompts(segment.prompts),
+        light=relight.given(),
+        weights=relight.weights,
+        harmonizer=content.get("harmonize", {}).get("method"),
+        **values,
+    )
+    check_state(state)
+    return state
+
+
+def write_state(project: Path, before: EditState, after: EditState) -> None:
+    """Update the files from state `before` to state `after`; equal parts stay untouched.
+
+    Files are written before project.toml, which must not refer to a missing file. Raise ValueError if project.toml
+    cannot be changed line by line.
+    """
+
+    def is_new(name: str) -> bool:
+        return getattr(after, name) is not getattr(before, name)
+
+    folder, old = project.parent, project.read_text(encoding="utf-8")
+    text, new_keys, old_keys = old, _keys(after), _keys(before)
+    for (table, key), value in new_keys.items():
+        # the file of a changed field may have another name, set by hand
+        is_file = key in _KEYS_OF_FILES and is_new(_KEYS_OF_FILES[key])
+        if is_file or json.dumps(value) != json.dumps(old_keys[table, key]):
+            text = with_keys(text, table, {key: value})
+    if after.corrections is not None and is_new("corrections"):
+        write_flags(folder / _CORRECTIONS_FILE, after.corrections)
+    if after.prompts is not None and is_new("prompts"):
+        write_prompts(folder / _PROMPTS_FILE, after.prompts)
+    if after.light is not None and is_new("light"):
+        with atomic_write(folder / LIGHT_FILE) as stream:
+            stream.write(light_to_json(after.light).encode())
+    if is_new("objects") or is_new("erased"):
+        if after.objects is None:
+            (folder / PLACEMENT_FILE).unlink(missing_ok=True)
+        else:
+            write_placement(folder / PLACEMENT_FILE, Placement(objects=after.objects, erased=after.erased))
+        if after.objects is None or after.erased is None:
+            (folder / ERASED_FILE).unlink(missing_ok=True)
+    if text != old:
+        with atomic_write(project) as stream:
+            stream.write(text.encode())
+
+
+def as_written(state: EditState, before: EditState) -> EditState:
+    """Round the light to six digits, as light.json does; a light shared with `before` stays identical."""
+    if state.light is None or state.light is before.light:
+        return state
+    return replace(state, light=light_from_json(light_to_json(state.light)))
+
+
+def state_files(project: Path) -> tuple[Path, ...]:
+    """Return all files that hold the state."""
+    names = (PLACEMENT_FILE, ERASED_FILE, _CORRECTIONS_FILE, _PROMPTS_FILE, LIGHT_FILE)
+    return (project, *(project.parent / name for name in names))
+
+
+def stamps_of(project: Path) -> Stamps:
+    """Return the current stamps of these files."""
+    return tuple((p.stat().st_mtime_ns, p.stat().st_size) if p.is_file() else None for p in state_files(project))
+
+
+def _keys(state: EditState) -> dict[tuple[str, str], Any]:
+    """Return all keys of the editor by table and name."""
+    segment = {
+        "mask_source": state.mask_source,
+        "box": state.box,
+        "keep": state.keep,
+        "corrections": None if state.corrections is None else _CORRECTIONS_FILE,
+        "prompts": None if state.prompts is None else _PROMPTS_FILE,
+    }
+    # a default, which is physically correct, needs no key
+    usual = asdict(LayerWeights())
+    relight = {key: None if value == usual[key] else value for key, value in asdict(state.weights).items()}
+    relight["given_light"] = None if state.light is None else LIGHT_FILE
+    tables = {"segment": segment, "relight": relight, "harmonize": {"method": state.harmonizer}}
+    return {(table, key): value for table, keys in tables.items() for key, value in keys.items()}

@@ -55,27 +55,34 @@ def read_placement(path: Path) -> Placement:
     unknown = sorted(set(content) - {"objects", "erased"})
     if unknown:
         raise ValueError(f'{path}: expected the keys "objects" and "erased", found also {unknown}')
-    objects = tuple(_object(entry, path, f"{path}: objects[{i}]") for i, entry in enumerate(content["objects"]))
-    erased = _file(content.get("erased"), path, f"{path}: erased")
+    entries, folder = content["objects"], path.parent
+    objects = tuple(object_from_json(entry, folder, f"{path}: objects[{i}]") for i, entry in enumerate(entries))
+    erased = _file(content.get("erased"), folder, f"{path}: erased")
     return Placement(objects=objects, erased=None if erased is None else read_flags(erased))
 
 
 def write_placement(path: Path, placement: Placement) -> None:
     """Write placement.json, and erased.npy beside it if anything is erased; reading restores both exactly."""
-    entries = []
-    for item in placement.objects:
-        named = {} if item.object_path is None else {"object": relative_name(item.object_path, path.parent)}
-        move = item.target_from_object
-        place = {"scale": move.scale, "rotation": move.rotation.tolist(), "translation": move.translation.tolist()}
-        entries.append(named | place)
-    content: dict[str, Any] = {"objects": entries}
+    content: dict[str, Any] = {"objects": [object_to_json(item, path.parent) for item in placement.objects]}
     if placement.erased is not None:
         content["erased"] = ERASED_FILE
         write_flags(path.parent / ERASED_FILE, placement.erased)
     save(path, content)
 
 
-def _object(entry: Any, path: Path, where: str) -> ObjectPlacement:
+def object_to_json(item: ObjectPlacement, folder: Path) -> dict[str, Any]:
+    """Convert one object to JSON's types, its path relative to `folder`; `object_from_json` restores it exactly."""
+    named = {} if item.object_path is None else {"object": relative_name(item.object_path, folder)}
+    move = item.target_from_object
+    return named | {
+        "scale": move.scale,
+        "rotation": move.rotation.tolist(),
+        "translation": move.translation.tolist(),
+    }
+
+
+def object_from_json(entry: Any, folder: Path, where: str) -> ObjectPlacement:
+    """Convert an entry of `objects`, with its path relative to `folder`; `where` is for messages."""
     if not isinstance(entry, dict) or not set(entry) <= set(_DEFAULTS):
         raise ValueError(f"{where}: expected an object with only {', '.join(_DEFAULTS)}, found {excerpt(entry)}")
     given = _DEFAULTS | entry
@@ -83,13 +90,13 @@ def _object(entry: Any, path: Path, where: str) -> ObjectPlacement:
     if scale <= 0 or not np.isfinite(translation).all():
         raise ValueError(f"{where}: expected a scale above 0 and a finite translation, found {excerpt(entry)}")
     move = Similarity(scale, _rotation(given, where), torch.from_numpy(translation).float())
-    return ObjectPlacement(move, _file(given["object"], path, f"{where} object"))
+    return ObjectPlacement(move, _file(given["object"], folder, f"{where} object"))
 
 
-def _file(name: Any, path: Path, where: str) -> Path | None:
+def _file(name: Any, folder: Path, where: str) -> Path | None:
     if name is not None and not isinstance(name, str):
         raise ValueError(f"{where}: expected a file name, found {excerpt(name)}")
-    return None if name is None else path.parent / name
+    return None if name is None else folder / name
 
 
 def _rotation(entry: dict[str, Any], where: str) -> Float[Tensor, "3 3"]:
