@@ -10,7 +10,6 @@ import pytest
 from editor_pages import Client, opened_editor
 from tiny_project import ball, photograph, plane
 
-from splatgraft.editor.project import RenderedViews
 from splatgraft.folders.input_description import describe_input
 from splatgraft.formats import write_gaussians
 from splatgraft.project.toml_edit import with_keys
@@ -137,8 +136,10 @@ def test_an_opened_project_shows_how_its_scenes_are_viewed(project: Path, monkey
         # one of them is changed: the other one stays
         window.do("look_target", "from within")
         window.wait(lambda: window.control("look_target")["value"] == "from within", what="the other look")
-        assert session.files.rendered_views[1] == RenderedViews((0.0, 0.25, 1.0), is_within=True)
+        source, target = (session.files.captures[side].look for side in ("source", "target"))
+        assert (target.up, target.look) == ((0.0, 0.25, 1.0), "within")
         window.do("up_target", "as found")
         window.wait(lambda: window.control("up_target")["value"] == "as found", what="the other up")
-        assert session.files.rendered_views[1] == RenderedViews(None, is_within=True)
-        assert session.files.rendered_views[0] == RenderedViews((0.0, -1.0, 0.0), is_within=True)
+        source, target = (session.files.captures[side].look for side in ("source", "target"))
+        assert (target.up, target.look) == (None, "within")
+        assert (source.up, source.look) == ((0.0, -1.0, 0.0), "within")

@@ -18,7 +18,6 @@ from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.composition import compose
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import read_rgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor import relit_preview
 from splatgraft.editor.light_process import LightProcess, Lit
@@ -60,17 +59,13 @@ def light(lit: Path, tmp_path_factory: pytest.TempPathFactory) -> Relit:
 def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Session, light: Relit) -> None:
     state, pictures = session.placed_state(), Pictures(session.scenes)
     camera = session.scenes.cameras(session.files.target_cameras)[0]
-    refused = {"result": "no result yet", "shadow": "being computed"}
-    for kind in ("lit", "pasted", "result", "place", "shadow", "photo"):
-        if kind in refused:
-            with pytest.raises(ValueError, match=refused[kind]):
-                pictures.draw(kind, state, camera, 0)
-            continue
-        picture = pictures.draw(kind, state, camera, 0)
+    with pytest.raises(ValueError, match="no result yet"):
+        pictures.draw("result", state, camera)
+    for kind in ("lit", "pasted", "place"):
+        picture = pictures.draw(kind, state, camera)
         assert picture.shape == (camera.height, camera.width, 3)
         assert picture.std() > 1, kind
     pictures.lit.add(state, Lit("final", light))
-    assert pictures.draw("shadow", state, camera).std() > 1
     assert pictures.lit.stage(state) == "final"
     # a draft that comes late does not replace it
     pictures.lit.add(state, Lit("draft", light))
@@ -176,15 +171,7 @@ def test_the_shown_object_without_light_equals_what_the_step_writes(session: Ses
     shown, written = pictures.lit.scene(state), read_gaussians(session.files.relit)
     assert torch.equal(shown.sh, written.sh)
     assert torch.equal(shown.means, written.means)
-    with pytest.raises(ValueError, match="off"):
-        pictures.draw("shadow", state, session.scenes.cameras(session.files.target_cameras)[0])
-
-
-def test_the_preview_of_a_photograph_is_unchanged(session: Session, tmp_path: Path) -> None:
-    camera = session.scenes.cameras(session.files.target_cameras)[0]
-    photo = Pictures(session.scenes).draw("photo", session.placed_state(), camera, 0)
-    stored = read_rgb(session.files.root.parent / "photos" / "target" / "images" / camera.names[0])
-    assert torch.equal(torch.from_numpy(photo), (stored * 255).round().to(torch.uint8))
+    assert pictures.lit.relit(state) is None
 
 
 @pytest.mark.long

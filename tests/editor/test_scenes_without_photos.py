@@ -10,7 +10,7 @@ from tiny_project import ball
 
 from splatgraft.cli import main
 from splatgraft.core.capture_orientation import estimate_up
-from splatgraft.editor.project import Project, RenderedViews
+from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.project.placement import read_placement
@@ -54,7 +54,8 @@ def test_a_box_alone_segments_and_the_whole_scene_may_be_the_object(tmp_path: Pa
     assert read_gaussians(project.parent / "object" / "object.ply").count == scene.count
     assert read_gaussians(project.parent / "object" / "surroundings.ply").count == 0
     session = Session(Project(project))
-    assert session.files.without_photos == (True, True)
+    assert not session.files.has_photos("source")
+    assert not session.files.has_photos("target")
     assert session.placeable_object(0).base.stands_on == "extent"
     # reading .spz rotates the axes, and the cameras rotate with them
     up = estimate_up(read_cameras(project.parent / "target" / "capture"))
@@ -66,14 +67,14 @@ def test_a_box_alone_segments_and_the_whole_scene_may_be_the_object(tmp_path: Pa
 def test_up_can_be_set_and_is_no_undo_step(tmp_path: Path) -> None:
     project = scene_project(tmp_path)
     session = Session(Project(project))
-    session.set_view("target", RenderedViews(up=(0.0, 0.0, -1.0)))
+    session.set_view("target", up=(0.0, 0.0, -1.0))
     assert not session.reload()
     assert not session.undo()
     assert main(["run", str(project), "--to", "reconstruct"]) == 0
     cameras = read_cameras(project.parent / "target" / "capture")
     assert torch.allclose(estimate_up(cameras), torch.tensor([0.0, 0.0, -1.0]), atol=0.02)  # two rings of eight cameras
     assert bool((cameras.centers[:, 2] < 0).all())
-    session.set_view("target", RenderedViews(is_within=True))
+    session.set_view("target", up=None, look="within")
     assert read_toml(project)["target"] == {
         "scene": "../target.ply",
         "views": 8,

@@ -260,7 +260,8 @@ def test_a_project_with_trained_scenes_names_them(session: Session, tmp_path: Pa
     made.create(captures, scenes=(session.files.source_scene, None))
     files = made.files()
     assert files is not None
-    assert files.without_photos == (False, False)
+    assert files.has_photos("source")
+    assert files.has_photos("target")
     given = read_toml(made.file)["source"]["scene"]
     assert (made.file.parent / given).resolve() == session.files.source_scene.resolve()
 

@@ -46,8 +46,6 @@ KINDS: dict[str, Kind] = {
     "Pasted, unlit": "pasted",
     "Result": "result",
     "Place alone": "place",
-    "Shadow alone": "shadow",
-    "Photo": "photo",
 }
 """Kinds of pictures of the target, by the label in the menu."""
 _POLL_SECONDS = 0.4
@@ -262,12 +260,9 @@ class Editor:
             if left == right:
                 continue
             part = camera if right - left == camera.width else camera.cropped([(left, 0, right, camera.height)])
-            if kind == "photo":
-                parts.append(pictures.draw(kind, state, camera, view.photo)[:, left:right])
-            else:
-                parts.append(pictures.draw(kind, state, part))
+            parts.append(pictures.draw(kind, state, part))
         caption = "full quality"
-        if self.kind in ("lit", "shadow") and state.objects:
+        if self.kind == "lit" and state.objects:
             words = {"": "old light: computing", "draft": "draft of the light", "refined": "light: nearly done"}
             caption = words.get(pictures.lit.stage(state), caption)
             caption = caption if session.files.transfers_light else "light transfer off"

@@ -1,6 +1,5 @@
 """The step `Open`: create a project from two captures or scenes, and reconstruct missing scenes."""
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,7 +8,6 @@ from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.editor.form import Form
 from splatgraft.editor.panel import Panel
 from splatgraft.editor.placement import Triple
-from splatgraft.editor.project import RenderedViews
 from splatgraft.editor.session import Session
 from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.folders.input_description import InputDescription, describe_input
@@ -40,7 +38,7 @@ _UPS: dict[str, Triple | None] = {
     "+x": (1.0, 0.0, 0.0),
     "-x": (-1.0, 0.0, 0.0),
 }
-_LOOKS = {"from around": False, "from within": True}
+_LOOKS = {"from around": "around", "from within": "within"}
 _TRAINED_HINT = "A trained scene (.ply, .spz, .sog, ...) in the same frame as its capture"
 _MAX_ROWS = 300  # listed entries of a folder
 
@@ -148,7 +146,7 @@ class OpenPanel(Panel):
         self.editor.project.create(captures, scenes=(first, second))
         self.editor.open_project()
         session = self.session
-        if all(session.files.without_photos):
+        if not any(map(session.files.has_photos, SIDES)):
             # importing two scenes takes no training, so it starts at once
             self.editor.run("reconstruct", _title(session))
         else:
@@ -164,8 +162,8 @@ class OpenPanel(Panel):
 
     def _build_open(self, form: Form, session: Session) -> None:
         files = session.files
-        for index, side in enumerate(SIDES):
-            form.note(self._line(session, index), name=f"facts_{side}")
+        for side in SIDES:
+            form.note(self._line(session, side), name=f"facts_{side}")
         have_both = files.have_both_scenes
         why = session.why_stale(*(f"{side}/reconstruct" for side in SIDES)) if have_both else None
         form.note("" if why is None else f"Out of date: {why}", name="stale")
@@ -173,30 +171,29 @@ class OpenPanel(Panel):
             title = "Update both scenes" if have_both else _title(session)
             form.button("build", title, lambda: self.editor.run("reconstruct", title), main=not have_both)
         form.more()
-        for index, side in enumerate(SIDES):
-            if files.without_photos[index]:
-                self._build_views(form, side, files.rendered_views[index])
+        for side in SIDES:
+            if not files.has_photos(side):
+                self._build_views(form, side)
 
-    def _build_views(self, form: Form, side: Side, views: RenderedViews) -> None:
+    def _build_views(self, form: Form, side: Side) -> None:
         """Add the choices for rendering a scene without photographs; an up along no axis is an extra option."""
-        ups = dict(_UPS)
+        views, ups = self.session.files.captures[side].look, dict(_UPS)
         if views.up not in ups.values():
             ups[f"({', '.join(f'{x:g}' for x in views.up or ())})"] = views.up
 
-        def set_views(field: str, value: object) -> None:
-            self.session.set_view(side, replace(views, **{field: value}))
+        def set_view(key: str, value: object) -> None:
+            self.session.set_view(side, **{key: value})
             self.editor.run("reconstruct", "Render the scene again")
 
-        form.choice(f"look_{side}", f"Cameras: {side}", views.is_within, _LOOKS, partial(set_views, "is_within"))
-        form.choice(f"up_{side}", f"Up: {side}", views.up, ups, partial(set_views, "up"))
+        form.choice(f"look_{side}", f"Cameras: {side}", views.look, _LOOKS, partial(set_view, "look"))
+        form.choice(f"up_{side}", f"Up: {side}", views.up, ups, partial(set_view, "up"))
 
-    def _line(self, session: Session, index: int) -> str:
-        files, name = session.files, _FIELDS[SIDES[index]]
-        scene, cameras = files.scene_and_cameras(SIDES[index])
+    def _line(self, session: Session, side: Side) -> str:
+        name, (scene, cameras) = _FIELDS[side], session.files.scene_and_cameras(side)
         if not scene.is_file():
             return f"{name}: not built yet"
         text = f"{name}: ready"
-        if files.without_photos[index] and cameras.is_file():
+        if not session.files.has_photos(side) and cameras.is_file():
             made = session.scenes.cameras(cameras)
             up = ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in estimate_up(made).tolist())
             text += f", without photographs: {len(made)} pictures were rendered of it, with ({up}) as up"
@@ -211,4 +208,4 @@ def parse_path(text: str) -> Path:
 
 
 def _title(session: Session) -> str:
-    return "Import both scenes" if all(session.files.without_photos) else "Reconstruct both scenes"
+    return "Reconstruct both scenes" if any(map(session.files.has_photos, SIDES)) else "Import both scenes"

@@ -72,7 +72,7 @@ class Panel:
     def __init__(self, editor: Editor) -> None:
         """Attach to an editor."""
         self.editor = editor
-        self._held_box: BoxDrag | None = None
+        self._held_box: tuple[Box, Corner] | None = None
 
     @property
     def session(self) -> Session:
@@ -104,12 +104,16 @@ class Panel:
 
     def dragged_box(self, view: View, pointer: Pointer, box: Box | None) -> Box | None:
         """Return the box whose corner the pointer drags; None if it drags none."""
-        held = self._held_box
+        held, is_lower = self._held_box, pointer.on == "lower"
         if pointer.what == "down" and box is not None:
-            self._held_box = BoxDrag(box, pointer.on, self.camera(view))
+            self._held_box = box, Corner(box.lower if is_lower else box.upper, self.camera(view))
         elif pointer.what != "move":
             self._held_box = None
-        return None if held is None or pointer.what in ("down", "cancel") else held.at(pointer.place)
+        if held is None or pointer.what in ("down", "cancel"):
+            return None
+        corner, opposite = held[1].at(pointer.place), held[0].upper if is_lower else held[0].lower
+        lower, upper = torch.minimum(corner, opposite), torch.maximum(corner, opposite)
+        return Box(lower, torch.maximum(upper, lower + _SHORTEST * float((upper - lower).max()) + 1e-9))
 
     def surface_under(self, pointer: Pointer, view: View, scene: Gaussians) -> tuple[Float[Tensor, 3], Ray]:
         """Return the point of a scene's surface under the pointer, and the ray through it.
@@ -154,22 +158,6 @@ class Panel:
 
     def job_ended(self, job: JobState) -> None:
         """Update the step after a job has ended; called for all steps."""
-
-
-class BoxDrag:
-    """A box whose corner, `lower` or `upper`, is dragged at its depth in a view."""
-
-    def __init__(self, box: Box, corner: str, camera: Cameras) -> None:
-        """Grab a corner."""
-        self._box, self._is_lower = box, corner == "lower"
-        self._corner = Corner(box.lower if self._is_lower else box.upper, camera)
-
-    def at(self, place: tuple[float, float]) -> Box:
-        """Return the box with the corner under the pointer."""
-        corner = self._corner.at(place)
-        ends = (corner, self._box.upper) if self._is_lower else (self._box.lower, corner)
-        lower, upper = torch.minimum(*ends), torch.maximum(*ends)
-        return Box(lower, torch.maximum(upper, lower + _SHORTEST * float((upper - lower).max()) + 1e-9))
 
 
 def box_over(box: Box, camera: Cameras, color: str) -> dict[str, Any]:

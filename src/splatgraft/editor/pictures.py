@@ -37,7 +37,7 @@ from splatgraft.rendering import RenderOptions, render, view_operator
 from splatgraft.runtime.memo import Memo
 from splatgraft.segmentation import CUT_SIDE_PX, grabcut_mask, seed_selection
 
-Kind = Literal["lit", "pasted", "result", "place", "shadow", "photo"]
+Kind = Literal["lit", "pasted", "result", "place"]
 TINT = (1.0, 0.45, 0.1)
 """sRGB colour of the selection."""
 _RANKS = {"draft": 0, "refined": 1, "file": 2, "final": 2}  # of stages of the light; a later one is better
@@ -268,14 +268,8 @@ class Pictures:
         self._scenes, self.lit, self._memo = scenes, LitScenes(scenes), Memo()
         self._drawing = threading.Lock()
 
-    def draw(
-        self, kind: Kind, state: EditState, camera: Cameras, photo: int | None = None
-    ) -> UInt8[np.ndarray, "h w 3"]:
+    def draw(self, kind: Kind, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
         """Draw the target; raise ValueError if an input does not exist yet."""
-        if kind == "photo":
-            return self._target_photo(camera, photo)
-        if kind == "shadow":
-            return self._shadow(state, camera)
         with self._drawing:  # a moved scene is valid until the next one is made
             return draw(self._scene(kind, state), camera)
 
@@ -287,24 +281,6 @@ class Pictures:
                 raise ValueError("There is no result yet: press Update result in Run.")
             return self._scenes.gaussians(self._scenes.files.result)
         return self.lit.pasted(state) if kind == "pasted" else self.lit.place(state)
-
-    def _shadow(self, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
-        relit = self.lit.relit(state)
-        if relit is None:
-            raise ValueError(
-                "The light is being computed." if self._scenes.files.transfers_light else "The light transfer is off."
-            )
-        # a ratio of 1 is mid grey, so that darkening and brightening both show
-        layers = (0.5 * relit.ratio(state.weights)).clamp(0, 1)
-        found = render(relit.gaussians, camera, outputs=frozenset(), features=layers)
-        return to_bytes(found.features[0] + 0.5 * (1 - found.alpha[0])[..., None])
-
-    def _target_photo(self, camera: Cameras, photo: int | None) -> UInt8[np.ndarray, "h w 3"]:
-        capture = self._scenes.capture(self._scenes.files.target_cameras)
-        if photo is None:
-            raise ValueError("Move to a photo to see it: under More, View.")
-        pixels = to_bytes(capture.image(photo))
-        return PhotoView((pixels.shape[1], pixels.shape[0]), (camera.width, camera.height)).drawn(pixels)
 
     # the source
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.composition.places import scale_in_view
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
@@ -21,19 +22,16 @@ from splatgraft.editor.pictures import same_places
 from splatgraft.editor.placement import (
     ObjectSize,
     PlaceableObject,
-    align_up,
     degrees_of,
     drop_to_surface,
     place_beside,
-    plausible_scale,
     rescale,
     rotation_of,
-    snapped_angles,
     suggest_placement,
     with_base,
 )
 from splatgraft.editor.sky_dome import SkyDome
-from splatgraft.editor.state import check_numbers, check_state
+from splatgraft.editor.state import check_state
 from splatgraft.editor.stream import View
 from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
 from splatgraft.project.layout import Side
@@ -111,7 +109,7 @@ class PlacePanel(Panel):
         scale, hint = objects[self._chosen].target_from_object.scale, "Over its size in its own photos"
         form.number("scale", "Scale", scale, lambda value: self._typed(scale=value), hint=hint)
         self._build_size(form)
-        form.buttons("move", {name: partial(self._operate, name) for name in ("Drop", "Upright", "Fit size")})
+        form.buttons("move", {"Drop": self._drop, "Fit size": self._fit_size})
         form.buttons("count", {"Duplicate": self._duplicate, "Delete": self._delete})
         form.note("Drag it along its support; with Alt onto another one.", name="hint", faint=True)
 
@@ -132,11 +130,9 @@ class PlacePanel(Panel):
         except ValueError as error:
             form.note(str(error), name="size", faint=True)
             return
-        here, true = size.here_cm, size.true_cm
-        if here is not None:
-            form.number("height", "Height, cm", round(here, 2), self._resize, step=0.01, hint="In the place")
-            if true is not None and abs(here / true - 1) > _SAME:
-                form.button("true_size", "As tall as it truly is", lambda: self._resize(true))
+        if size.cm_per_scale is not None:
+            here = round(size.scale * size.cm_per_scale, 2)
+            form.number("height", "Height, cm", here, self._resize, step=0.01, hint="In the place")
         given = self.session.files.compose.options.scale
         is_given = given is not None and abs(size.scale / given - 1) < _SAME
         form.note(_about(size, is_given=is_given), name="size", faint=True)
@@ -154,13 +150,10 @@ class PlacePanel(Panel):
 
     def _typed(self, *, position: Any = None, degrees: Any = None, scale: float | None = None) -> None:
         item, placed = self._one()
-        check_numbers(degrees or (), "rotation")
-        check_numbers((*(position or ()), placed.scale if scale is None else scale), "position, scale")
-        if scale is not None and scale <= 0:
-            raise ValueError(f"scale: expected a number above 0, found {scale:g}")
         at = self._base() if position is None else torch.tensor(position)
         rotation = placed.rotation if degrees is None else rotation_of(degrees)
-        self._place(with_base(item, Similarity(scale or placed.scale, rotation, placed.translation), at=at))
+        size = placed.scale if scale is None else scale
+        self._place(with_base(item, Similarity(size, rotation, placed.translation), at=at))
 
     def _place(self, target_from_object: Similarity) -> None:
         self.session.set_placement(self._chosen, target_from_object)
@@ -169,21 +162,17 @@ class PlacePanel(Panel):
         """Change fields of the state with the objects of `compose` filled in."""
         self.session.change(replace(self.session.placed_state(), **fields))
 
-    def _operate(self, name: str) -> None:
-        session = self.session
-        if not session.objects():
-            return
-        (item, placed), up = self._one(), session.up()
-        target = session.scenes.composite(session.placed_state()).target
-        if name == "Drop":
-            self._place(drop_to_surface(target, item, placed, up=up))
-            self.editor.say("dropped: it stands upright on the surface below")
-        elif name == "Upright":
-            self._place(align_up(item, placed, up=up))
-        else:
-            cameras = session.scenes.cameras(session.files.target_cameras)
-            self._place(rescale(item, placed, plausible_scale(target, item, placed, cameras)))
-            self.editor.say("scaled to about a third of the views' height, which is a guess")
+    def _drop(self) -> None:
+        (item, placed), scenes = self._one(), self.session.scenes
+        target = scenes.composite(self.session.placed_state()).target
+        self._place(drop_to_surface(target, item, placed, up=self.session.up()))
+        self.editor.say("dropped: it stands upright on the surface below")
+
+    def _fit_size(self) -> None:
+        (item, placed), session = self._one(), self.session
+        cameras = session.scenes.cameras(session.files.target_cameras)
+        self._place(rescale(item, placed, scale_in_view(item.base, self._base(), cameras=cameras)))
+        self.editor.say("scaled to about a third of the views' height, which is a guess")
 
     def _find_place(self) -> None:
         session = self.session
@@ -200,10 +189,7 @@ class PlacePanel(Panel):
         )
 
     def _duplicate(self) -> None:
-        session = self.session
-        if not session.objects():
-            return
-        item, placed = self._one()
+        session, (item, placed) = self.session, self._one()
         beside, is_supported = place_beside(self._merged(), item, placed, up=session.up())
         self._append(replace(session.objects()[self._chosen], target_from_object=beside))
         if not is_supported:
@@ -211,8 +197,7 @@ class PlacePanel(Panel):
 
     def _delete(self) -> None:
         objects = self.session.objects()
-        if objects:
-            self._change(objects=(*objects[: self._chosen], *objects[self._chosen + 1 :]))
+        self._change(objects=(*objects[: self._chosen], *objects[self._chosen + 1 :]))
 
     def _set_path(self, value: str) -> None:
         self._path = value.strip()
@@ -244,7 +229,7 @@ class PlacePanel(Panel):
     def _set_scale(self, side: Side) -> None:
         session, cm = self.session, self._known_cm
         path = session.set_scale(self._chosen, cm, side)
-        if side == "source" and session.size(self._chosen).place is not None:
+        if side == "source" and session.size(self._chosen).cm_per_scale is not None:
             self._resize(cm)
         self.editor.say(f"stored in {path}, as `splatgraft scale` does; Undo leaves it")
 
@@ -252,9 +237,11 @@ class PlacePanel(Panel):
 
     def key(self, view: View, key: str) -> bool:
         """Handle the keys of this step."""
+        if not self.session.objects():
+            return False
         arrows = {"arrowleft": (-1, 0), "arrowright": (1, 0), "arrowup": (0, 1), "arrowdown": (0, -1)}
         work: dict[str, Callable[[], object]] = {
-            "g": lambda: self._operate("Drop"),
+            "g": self._drop,
             "ctrl+d": self._duplicate,
             "delete": self._delete,
             "backspace": self._delete,
@@ -268,11 +255,8 @@ class PlacePanel(Panel):
 
     def _nudge(self, view: View, right: int, away: int) -> None:
         """Move the chosen object by small steps to the right in the view and away from the viewer."""
-        orbit = self.editor.orbit(view)
-        if orbit is None or not self.session.objects():
-            return
         item, placed = self._one()
-        dome = SkyDome.seen_along(torch.tensor(orbit.forward).float(), self.session.up())
+        dome = SkyDome.seen_along(self.camera(view).world_from_camera[0, :3, 2], self.session.up())
         step = _NUDGE * placed.scale * max(item.base.height, item.base.radius)
         self._place(replace(placed, translation=placed.translation + step * (right * dome.right + away * dome.forward)))
 
@@ -322,9 +306,9 @@ class PlacePanel(Panel):
             return
         placed = held.at(mode, start, pointer.place, anywhere=pointer.alt)
         if mode == "turn" and self._snaps:
-            turned = rotation_of(snapped_angles(degrees_of(placed.rotation), _SNAP_DEGREES))
+            x, y, z = (_SNAP_DEGREES * round(angle / _SNAP_DEGREES) for angle in degrees_of(placed.rotation))
             foot = placed.points(held.item.base.point)
-            placed = with_base(held.item, replace(placed, rotation=turned), at=foot)
+            placed = with_base(held.item, replace(placed, rotation=rotation_of((x, y, z))), at=foot)
         item = replace(session.objects()[index], target_from_object=placed)
         edited = session.placed_state().with_object(index, item)
         check_state(edited)
@@ -355,14 +339,14 @@ class PlacePanel(Panel):
 
 def _about(size: ObjectSize, *, is_given: bool) -> str:
     """Describe an object's known size and how to enter the rest; `is_given`: project.toml sets the scale."""
-    if size.place is None and is_given:
+    if size.cm_per_scale is None and is_given:
         return (
             "Same size as in its photos."
             if math.isclose(size.scale, 1.0)
             else f"{size.scale:.4g} times its size in its photos, as the project says."
         )
-    if size.place is None:
+    if size.cm_per_scale is None:
         return "Its size here is a guess, as nobody has measured the place: under More, type the object's true height."
-    if size.own is None:
+    if size.true_cm is None:
         return "How tall it truly is, is not known: type it under More."
     return f"In its own photos it is {size.true_cm:.4g} cm tall."

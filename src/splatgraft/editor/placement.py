@@ -1,4 +1,4 @@
-"""An object's placement: its angles and size, and operations such as drop, upright, rescale and duplicate."""
+"""An object's placement: its angles and size, and operations such as drop, rescale and duplicate."""
 
 import math
 import warnings
@@ -12,12 +12,9 @@ from torch import Tensor
 
 from splatgraft.composition import NoFreePlaceError, ObjectBase, Placed, PlaceOptions, place_object, rest_on_surface
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.capture_orientation import estimate_up
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.rotations import rotation_between
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.state import check_height_cm
-from splatgraft.project.metric_scale import MetricScale
 
 Triple = tuple[float, float, float]
 
@@ -47,33 +44,21 @@ def rotation_of(degrees: Triple) -> Float[Tensor, "3 3"]:
 
 @dataclass(frozen=True)
 class ObjectSize:
-    """The size of one placed object, and the captures' scales if they are known."""
+    """The size of one placed object; what is None depends on an unknown scale of a capture."""
 
-    height: float
-    """Height from base to top, units of its own capture."""
     scale: float
     """Size in the target over size in its own capture."""
-    own: MetricScale | None
-    """Scale of the object's own capture; None if it is unknown or the object was added from a file."""
-    place: MetricScale | None
-    """Scale of the target's capture; None if it is unknown."""
-
-    @property
-    def here_cm(self) -> float | None:
-        """Height in the target, cm; None if its scale is unknown."""
-        return None if self.place is None else 100 * self.place.metres_per_unit * self.scale * self.height
-
-    @property
-    def true_cm(self) -> float | None:
-        """Height in its own capture, cm; None if that scale is unknown."""
-        return None if self.own is None else 100 * self.own.metres_per_unit * self.height
+    true_cm: float | None
+    """Height in its own capture, cm; None also if the object was added from a file."""
+    cm_per_scale: float | None
+    """Height in the target, cm, at a `scale` of 1."""
 
     def scale_at(self, here_cm: float) -> float:
         """Return the `scale` for a height in the target; raise ValueError if the target's scale is unknown."""
         check_height_cm(here_cm)
-        if self.place is None:
+        if self.cm_per_scale is None:
             raise ValueError("target: expected a capture whose scale is known, found none; see `splatgraft scale`")
-        return 0.01 * here_cm / (self.place.metres_per_unit * self.height)
+        return here_cm / self.cm_per_scale
 
 
 @dataclass(frozen=True)
@@ -121,15 +106,6 @@ def drop_to_surface(
     return rest_on_surface(target, item.base, point=above, up=up, scale=scale, yaw_deg=math.degrees(twist))[0]
 
 
-def align_up(item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]) -> Similarity:
-    """Apply the smallest rotation that aligns the object's up with `up`; the base point stays fixed."""
-    up = torch.nn.functional.normalize(up, dim=0)
-    rotation = rotation_between(target_from_object.rotation @ item.base.up, up) @ target_from_object.rotation
-    return with_base(
-        item, replace(target_from_object, rotation=rotation), at=target_from_object.points(item.base.point)
-    )
-
-
 def rescale(item: PlaceableObject, target_from_object: Similarity, scale: float) -> Similarity:
     """Set the scale; the base point stays fixed."""
     return with_base(item, replace(target_from_object, scale=scale), at=target_from_object.points(item.base.point))
@@ -139,18 +115,6 @@ def with_base(item: PlaceableObject, target_from_object: Similarity, *, at: Floa
     """Move the object so that its base point is at a point of the target."""
     offset = target_from_object.scale * target_from_object.rotation @ item.base.point
     return replace(target_from_object, translation=at - offset)
-
-
-def plausible_scale(
-    target: Gaussians, item: PlaceableObject, target_from_object: Similarity, cameras: Cameras
-) -> float:
-    """Return the scale at which the object fills the default share of the views."""
-    x, y, z = (
-        target_from_object.points(item.base.point)
-        + 0.25 * target_from_object.scale * item.base.height * estimate_up(cameras)
-    ).tolist()
-    options = PlaceOptions(point=(x, y, z), yaw_deg=0.0)
-    return suggest_placement(target, item, cameras, options).target_from_object.scale
 
 
 def place_beside(
@@ -182,12 +146,6 @@ def place_beside(
             # keep the rotation; adapt only the height
             return _shifted(shifted, drop * up), True
     return _shifted(target_from_object, step * across), False
-
-
-def snapped_angles(degrees: tuple[float, float, float], step: float) -> tuple[float, float, float]:
-    """Round angles to multiples of `step` degrees."""
-    x, y, z = (round(angle / step) * step for angle in degrees)
-    return x, y, z
 
 
 def _reach(item: PlaceableObject) -> float:

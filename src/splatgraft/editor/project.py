@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Literal
 
 from splatgraft.commands.init import Init
-from splatgraft.editor.placement import Triple
 from splatgraft.exports.export import Layer
 from splatgraft.formats import is_scene
 from splatgraft.project.layout import (
@@ -32,16 +31,6 @@ ExportPage = Literal["viewer", "report"]
 """Contents of an exported .html."""
 PROBLEM = "project"
 """Entry of `Project.reasons` if project.toml is invalid."""
-
-
-@dataclass(frozen=True)
-class RenderedViews:
-    """Options for rendering images of a scene without photographs."""
-
-    up: Triple | None = None
-    """Up direction in the scene's frame; None: estimated."""
-    is_within: bool = False
-    """Whether the cameras look outwards from the middle of the scene, or inwards from around it."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +63,8 @@ class ProjectFiles:
     """The consolidated scene."""
     report: Path
     """The folder of index.html."""
-    without_photos: tuple[bool, bool]
-    """Whether source and target are scenes without photographs, whose images are rendered from the scene."""
-    rendered_views: tuple[RenderedViews, RenderedViews]
-    """Options for rendering the images of source and target, used for scenes without photographs."""
+    captures: Mapping[Side, Capture]
+    """The steps that make the posed source and target."""
     compose: Compose
     """The step that places the objects."""
     relight: Relight
@@ -88,6 +75,10 @@ class ProjectFiles:
         return (
             (self.source_scene, self.source_cameras) if side == "source" else (self.target_scene, self.target_cameras)
         )
+
+    def has_photos(self, side: Side) -> bool:
+        """Return whether a side has photographs; otherwise its images are rendered from a trained scene."""
+        return not is_scene(self.captures[side].capture)
 
     @property
     def have_both_scenes(self) -> bool:
@@ -141,8 +132,7 @@ class Project:
             relit=layout.relit / SCENE_FILE,
             result=layout.result / SCENE_FILE,
             report=layout.report,
-            without_photos=(is_scene(source.capture), is_scene(target.capture)),
-            rendered_views=(_rendered_views(source), _rendered_views(target)),
+            captures={"source": source, "target": target},
             compose=compose,
             relight=relight,
         )
@@ -162,13 +152,10 @@ class Project:
         Init(folder=self.file.parent, source=captures[0], target=captures[1]).execute(Console())
         for side, scene in zip(SIDES, scenes, strict=True):
             if scene is not None:
-                self._set_keys(side, {"scene": relative_name(scene, self.file.parent)})
+                self.set_keys(side, {"scene": relative_name(scene, self.file.parent)})
 
-    def set_view(self, side: Side, views: RenderedViews) -> None:
-        """Set how images of a scene without photographs are rendered."""
-        self._set_keys(side, {"up": views.up, "look": "within" if views.is_within else None})
-
-    def _set_keys(self, table: str, keys: Mapping[str, object]) -> None:
+    def set_keys(self, table: str, keys: Mapping[str, object]) -> None:
+        """Set keys of a table of project.toml; None removes a key."""
         text = with_keys(self.file.read_text(encoding="utf-8"), table, keys)
         with atomic_write(self.file) as stream:
             stream.write(text.encode())
@@ -182,10 +169,6 @@ class Project:
         """Return the arguments of `splatgraft` that write the result or a part of it in the suffix's format."""
         part = ("--page", page) if page == "report" else () if layer == "all" else ("--layer", layer)
         return ("export", str(self.root), "--to", str(to), *part)
-
-
-def _rendered_views(capture: Capture) -> RenderedViews:
-    return RenderedViews(capture.look.up, capture.look.look == "within")
 
 
 _WEIGHTS = tuple(field.name for field in fields(LayerWeights))

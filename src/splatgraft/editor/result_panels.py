@@ -97,9 +97,6 @@ class SharePanel(Panel):
         form.choice("kind_of_file", "As", kind, sharing.SHARE_KINDS, self._sets("_kind"))
         form.note(why_not or "", name="share")
         form.button("write", "Write and download", self._start, main=True, disabled=why_not is not None)
-        job = session.jobs.state()
-        if job is not None and job.live and job.command[:1] == ("export",):
-            form.progress("export", job.fraction)
         form.button("view_picture", "Picture of this view", self._send_picture)
         form.links("written", self._links(session))
         form.more()

@@ -97,8 +97,6 @@ class SelectPanel(Panel):
             lower, upper = state.box[:3], state.box[3:]
             form.numbers("box_from", "Box from", lower, lambda v: self._set(box=(*v, *upper)))
             form.numbers("box_to", "Box to", upper, lambda v: self._set(box=(*lower, *v)))
-            parts = {"Add what is in the box": True, "Remove it": False}
-            form.buttons("box_parts", {label: partial(self._box_corrects, add) for label, add in parts.items()})
 
     def _said(self, is_any: bool) -> str:
         if not is_any:
@@ -260,11 +258,6 @@ class SelectPanel(Panel):
             self.editor.say(
                 "leave the photo by dragging the view; then drag the two corners until the box holds the object"
             )
-
-    def _box_corrects(self, add: bool) -> None:
-        box = self.session.box()
-        if box is not None:
-            self._correct(box.contains(self._scene().means), add=add)
 
     def _default_box(self) -> Box:
         """Return the box around the cameras' focus, or the middle half of the scene if there is no capture."""

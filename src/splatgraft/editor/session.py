@@ -16,7 +16,7 @@ from splatgraft.editor.history import History, StateStore
 from splatgraft.editor.jobs import Jobs
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.placement import ObjectSize, PlaceableObject
-from splatgraft.editor.project import PROBLEM, Project, ProjectFiles, RenderedViews, in_words
+from splatgraft.editor.project import PROBLEM, Project, ProjectFiles, in_words
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import (
     EditState,
@@ -120,11 +120,14 @@ class Session:
                 self._save_history(self.history.pushed(name))
             return True
 
-    def set_view(self, side: Side, views: RenderedViews) -> None:
-        """Set how images of a scene without photographs are rendered; not an undo step. Raises as `change`."""
+    def set_view(self, side: Side, **keys: object) -> None:
+        """Set `up` or `look` of a scene without photographs, None for the default; not an undo step.
+
+        Raises as `change`.
+        """
         with self._lock:
             self._refuse_outside_changes()
-            self.project.set_view(side, views)
+            self.project.set_keys(side, keys)
             self._stamps = stamps_of(self.files.file)
             self.scenes.files = self.project.files() or self.files
 
@@ -216,14 +219,14 @@ class Session:
 
     def size(self, index: int) -> ObjectSize:
         """Return the size of one placed object; raise ValueError if a scale.json cannot be read."""
-        item = self.objects()[index]
+        item, height = self.objects()[index], self.placeable_object(index).base.height
         is_own = self.scenes.object_path(item) == self.files.object
-        return ObjectSize(
-            height=self.placeable_object(index).base.height,
-            scale=item.target_from_object.scale,
-            own=read_scale(self.files.source_cameras) if is_own else None,
-            place=read_scale(self.files.target_cameras),
+        own = read_scale(self.files.source_cameras) if is_own else None
+        true_cm, cm_per_scale = (
+            None if known is None else 100 * known.metres_per_unit * height
+            for known in (own, read_scale(self.files.target_cameras))
         )
+        return ObjectSize(item.target_from_object.scale, true_cm, cm_per_scale)
 
     def true_scale(self) -> float | None:
         """Return the scale that keeps the true size of the source's object; None if a capture's scale is unknown."""
@@ -233,12 +236,11 @@ class Session:
     def set_scale(self, index: int, cm: float, side: Side) -> Path:
         """Store the scale of a capture from the height of a placed object in it; return the file."""
         check_height_cm(cm)
-        size, path = self.size(index), self.scenes.object_path(self.objects()[index])
+        item, height, by = self.objects()[index], self.placeable_object(index).base.height, "the object's"
+        path = self.scenes.object_path(item)
         if side == "target":
-            height, by = size.scale * size.height, "a placed object's"
-        elif path == self.files.object:
-            height, by = size.height, "the object's"
-        else:
+            height, by = item.target_from_object.scale * height, "a placed object's"
+        elif path != self.files.object:
             raise ValueError(
                 f"{path}: expected the object of the project's source, found one that was added from a file"
             )

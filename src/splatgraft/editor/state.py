@@ -81,17 +81,16 @@ def check_state(state: EditState) -> None:
     for index, item in enumerate(state.objects or ()):
         where, move = f"{PLACEMENT_FILE}: object {index + 1}", item.target_from_object
         _check_number(move.scale, f"{where}: scale", _SCALES)
-        check_numbers(move.translation.tolist(), f"{where}: position")
+        _check_coordinates(move.translation.tolist(), f"{where}: position")
     if state.box is not None:
-        check_numbers(state.box, "box")
+        _check_coordinates(state.box, "box")
         # in float32, as the box is used
         lower, upper = torch.tensor(state.box[:3]), torch.tensor(state.box[3:])
         if not bool((lower < upper).all()):
             raise ValueError(f"box: expected lower < upper, found {list(state.box[:3])} and {list(state.box[3:])}")
 
 
-def check_numbers(values: Iterable[float], where: str) -> None:
-    """Check that typed or dragged numbers are in the range of coordinates, as `check_state` does."""
+def _check_coordinates(values: Iterable[float], where: str) -> None:
     for value in values:
         _check_number(value, where, _COORDINATES)
 

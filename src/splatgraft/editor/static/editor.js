@@ -193,7 +193,6 @@ const KINDS = {
     make: makeDrawing,
     update: (made, one) => { if (!made.dataset.busy && made.dataset.svg !== one.svg) { made.innerHTML = one.svg; made.dataset.svg = one.svg; } },
   },
-  progress: { make: () => element("progress", { max: 1 }), update: (made, one) => { made.value = one.value || 0; } },
   links: { make: () => element("div"), update: (made, one) => made.replaceChildren(...one.options.map(linkLine)) },
 };
 
