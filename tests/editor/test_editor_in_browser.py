@@ -82,10 +82,10 @@ def test_a_user_s_story(shown: Page, project: Path) -> None:
     xs, ys = zip(*overlay["hulls"][0], strict=True)
     middle = sum(xs) / len(xs) * hull["width"], sum(ys) / len(ys) * hull["height"]
     shown.drag(middle, (50.0, 20.0))
-    shown.until(lambda: bool(session.history.past), "the moved object")
+    shown.until(lambda: bool(session.history.at), "the moved object")
     assert float((session.objects()[0].target_from_object.translation - placed).norm()) > 0.01
     page.keyboard.press("Control+z")
-    shown.until(lambda: not session.history.past, "the object's first place")
+    shown.until(lambda: not session.history.at, "the object's first place")
     # an emptied field shows its number again, and a typed one is saved while the page is refreshed
     scale = page.locator("[data-id=scale] input")
     scale.fill("")

@@ -136,7 +136,7 @@ def test_objects_are_duplicated_added_by_an_upload_and_parts_of_the_target_erase
     window.do("restore")
     window.wait(lambda: not window.has("restore"), what="all restored")
     assert read_state(session.files.file).erased is None
-    while session.undo():
+    while session.step(-1):
         pass
     assert len(session.objects()) == 1
 
@@ -146,7 +146,7 @@ def test_a_watching_window_changes_nothing_and_edits_when_the_first_is_closed(ed
     with first.window(), second.window(size=(320, 200)):
         assert first.panel["editing"]
         assert not second.panel["editing"]
-        before = len(session.history.past)
+        before = session.history.at
         second.send("do", id="count", value="Delete")
         second.send("key", key="delete")
         second.send("step", to="Run")
@@ -157,7 +157,7 @@ def test_a_watching_window_changes_nothing_and_edits_when_the_first_is_closed(ed
         second.wait(
             lambda: second.pixels.shape != seen.shape or bool((second.pixels != seen).any()), what="its own view"
         )
-        assert (len(session.history.past), editor.step) == (before, "Place")
+        assert (session.history.at, editor.step) == (before, "Place")
         first.socket.close()
         second.wait(lambda: second.panel["editing"], what="its turn")
         second.do("count", "Delete")
@@ -230,7 +230,7 @@ def test_a_stale_result_is_marked_with_the_button_that_renews_it(project: Path) 
         offer = window.panel["offer"]
         assert offer["name"] == "project.ply"
         assert window.get(f"/{offer['url']}") == 200
-        assert session.undo()
+        assert session.step(-1)
         placed = session.objects()[0].target_from_object
         session.set_placement(0, replace(placed, translation=placed.translation + 0.01))
         editor.refresh()
@@ -257,7 +257,7 @@ def test_nothing_is_lost_or_hidden_where_the_disk_is_full(project: Path, monkeyp
         window.says("Disk full: nothing can be saved")
         assert window.panel["saved"] == "not saved"
         window.do("scale", [0.5])
-        window.says("Disk full: not saved.")
+        window.says("Disk full: nothing can be saved")
         assert window.panel["bad"]
         assert (before.objects, read_state(project).objects) == (None, None)
         is_full = False
@@ -266,7 +266,7 @@ def test_nothing_is_lost_or_hidden_where_the_disk_is_full(project: Path, monkeyp
         window.wait(lambda: window.control("scale")["value"] == [0.5], what="the change")
         is_full = True
         window.do("scale", [0.7])
-        window.says("Disk full: not saved.")
+        window.says("Disk full: nothing can be saved")
         assert window.panel["saved"] == "not saved"
         assert window.control("scale")["value"] == [0.5]
 
@@ -329,7 +329,7 @@ def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(project: Path, m
         # while a slider is dragged nothing is saved
         window.send("live", id="exposure", value=1.0)
         window.wait(lambda: editor.live is not None, what="the preview")
-        assert not session.history.past
+        assert not session.history.at
         for name, value in (("exposure", 1.0), ("tint", 0.5), ("shadow", 0.25)):
             window.do(name, value)
         wanted = LayerWeights(exposure=1.0, tint=0.5, shadow=0.25)

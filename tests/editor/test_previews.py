@@ -270,7 +270,7 @@ def test_what_drafts_share_is_computed_before_the_first_move(project: Path, monk
         assert len({id(call.kwargs["erased"]) for call in drawn.call_args_list}) == 1
         reduced.clear()
         drawn.reset_mock()
-        session.undo()
+        session.step(-1)
     assert torch.equal(drafts[0].relit.shadow, drafts[1].relit.shadow)
     assert torch.equal(drafts[0].relit.shade, drafts[1].relit.shade)
 

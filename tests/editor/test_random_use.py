@@ -98,6 +98,6 @@ def test_random_use_in_two_windows(project: Path, capfd: pytest.CaptureFixture[s
             assert state.weights == written.weights
             first.finished()
             assert np.isfinite(first.pixels).all()
-            while session.undo():
+            while session.step(-1):
                 pass
     assert "Traceback" not in capfd.readouterr().err

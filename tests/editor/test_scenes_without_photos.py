@@ -69,7 +69,7 @@ def test_up_can_be_set_and_is_no_undo_step(tmp_path: Path) -> None:
     session = Session(Project(project))
     session.set_view("target", up=(0.0, 0.0, -1.0))
     assert not session.reload()
-    assert not session.undo()
+    assert not session.step(-1)
     assert main(["run", str(project), "--to", "reconstruct"]) == 0
     cameras = read_cameras(project.parent / "target" / "capture")
     assert torch.allclose(estimate_up(cameras), torch.tensor([0.0, 0.0, -1.0]), atol=0.02)  # two rings of eight cameras

@@ -252,7 +252,7 @@ def test_pictures_of_orbit_drag_and_release_are_the_renderer_s_and_end_as_the_st
     window.wait(lambda: editor.live is not None, what="the drag")
     dragged = editor.shown_state().objects
     window.send("pointer", what="up", on="object:0", x=x + 0.08, y=y + 0.04, mode="move")
-    window.wait(lambda: bool(session.history.past) and editor.live is None, what="the release")
+    window.wait(lambda: bool(session.history.at) and editor.live is None, what="the release")
     assert dragged is not None
     moved = session.objects()[0].target_from_object
     window.send("pointer", what="cancel", on="", x=0, y=0)

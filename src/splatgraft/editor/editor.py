@@ -39,7 +39,6 @@ from splatgraft.editor.stream import Stream, View
 from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.project.layout import Side
 from splatgraft.runtime.files import is_disk_full, os_error_line
-from splatgraft.runtime.memo import Memo
 
 KINDS: dict[str, Kind] = {
     "With its new light": "lit",
@@ -61,7 +60,7 @@ _WORDS = {"do": "id", "live": "id", "key": "key", "step": "to"}
 _MAX_ACTIONS = 200  # waiting messages
 _UPLOADS_FOLDER = "uploads"
 _GREY = 48  # value of a picture that cannot be drawn, 0 to 255
-_FULL_DISK = "Disk full: not saved."
+_FULL_DISK = "Disk full: nothing can be saved."
 
 
 class Editor:
@@ -81,14 +80,13 @@ class Editor:
         """Kind of the picture of the target."""
         self.before: Kind = "pasted"
         """Kind of the comparison picture."""
-        self.status, self.is_bad, self.is_unsaved = "", False, False
+        self.status, self.is_bad = "", False
         self.offer: dict[str, Any] | None = None
         """File for the editing window to download."""
         self._light: LightProcess | None = None
         self._form = Form()
         self._seen: Stamps = ()
         self._marks: dict[str, str] = {}
-        self._memo = Memo()
         self._last_job = ""
         self._is_open = True
         self._actions: queue.Queue[tuple[Window, dict[str, Any]] | None] = queue.Queue(_MAX_ACTIONS)
@@ -212,19 +210,20 @@ class Editor:
             form.while_dragged("photo", show)
 
     def _send_panel(self) -> None:
-        session = self.session
-        saved = "" if session is None else "not saved" if self.is_unsaved or session.unsaved else "saved"
+        session, status, is_bad = self.session, self.status, self.is_bad
+        is_unsaved = session is not None and session.is_unsaved
+        if is_unsaved and not status:
+            status, is_bad = _FULL_DISK, True
         panel = {
             "t": "panel",
             "project": "no project yet" if session is None else session.files.file.parent.name,
-            "saved": saved,
+            "saved": "" if session is None else "not saved" if is_unsaved else "saved",
             "steps": [[name, _CURRENT if name == self.step else self._marks.get(name, "")] for name in self.panels],
-            "controls": self._form.controls,
-            "status": self.status if self.status or session is None else session.unsaved or "",
-            "bad": self.is_bad or bool(session and session.unsaved and not self.status),
-            "undo": bool(session and session.history.past),
-            "redo": bool(session and session.history.future),
-            "job": self._job(),
+            "controls": [*self._form.controls, *self._job_controls()],
+            "status": status,
+            "bad": is_bad,
+            "undo": bool(session and session.history.at),
+            "redo": bool(session and session.history.undone),
             **self.panels[self.step].tools(),
         }
         for index, view in enumerate(self.stream.views):
@@ -306,9 +305,7 @@ class Editor:
 
     def up(self) -> np.ndarray:
         """Return the up direction of the shown scene."""
-        session, side = self.require_session(), self.side
-        # kept here, because views must not wait for a session's computations
-        return self._memo.get(f"up {side}", (self.cameras(),), lambda: session.up(side).double().numpy())
+        return self.require_session().up(self.side).double().numpy()
 
     def _free_space(self) -> FreeSpace | None:
         session, cameras = self.session, self.cameras()
@@ -320,7 +317,7 @@ class Editor:
             foot = objects[0].target_from_object.points(session.placeable_object(0).base.point) if objects else None
             return FreeSpace.of(scene, cameras, session.up("target"), foot)
 
-        return self._memo.get("free space", (scene, objects), make)
+        return session.scenes.derive("free space", (scene, objects), make)
 
     def _want_light(self) -> None:
         session = self.session
@@ -479,8 +476,8 @@ class Editor:
 
     def _press(self, view: View, key: str) -> None:
         common: dict[str, Callable[[], object]] = {
-            "ctrl+z": lambda: self._undo(self.require_session().undo(), "undone", "nothing to undo"),
-            "ctrl+shift+z": lambda: self._undo(self.require_session().redo(), "redone", "nothing to redo"),
+            "ctrl+z": lambda: self._undo(self.require_session().step(-1), "undone", "nothing to undo"),
+            "ctrl+shift+z": lambda: self._undo(self.require_session().step(1), "redone", "nothing to redo"),
             "f": lambda: self._look_at_object(view),
             "home": lambda: self.to_photo(0),
         }
@@ -530,9 +527,12 @@ class Editor:
         try:
             yield
         except (ValueError, OSError) as error:
-            is_full, line = is_disk_full(error), os_error_line(error) if isinstance(error, OSError) else str(error)
-            self.is_unsaved = self.is_unsaved or is_full
-            self.say(_FULL_DISK if is_full else line, bad=True)
+            line = os_error_line(error) if isinstance(error, OSError) else str(error)
+            if is_disk_full(error):
+                line = _FULL_DISK
+                if self.session is not None:
+                    self.session.is_unsaved = True
+            self.say(line, bad=True)
         except Exception as error:  # a programming error must be visible and must not end the page
             traceback.print_exc()
             self.say(f"{type(error).__name__}: {error} (traceback in the terminal)", bad=True)
@@ -590,8 +590,7 @@ class Editor:
                 session.pictures.lit.forget()
                 self.say("the project's files were changed outside the editor and were loaded again")
                 self.refresh()
-            elif session is not None and (session.unsaved or self.is_unsaved) and session.save_again():
-                self.is_unsaved = False
+            elif session is not None and session.is_unsaved and session.save_again():
                 self.say("saved again")
                 self.refresh()
             if self._light is not None and not self._light.is_started:
@@ -620,26 +619,22 @@ class Editor:
                 panel.job_ended(state)
         self.refresh()
 
-    def _job(self) -> dict[str, Any] | None:
-        """Describe the running job for the page."""
-        state = None if self.session is None else self.session.jobs.state()
-        if state is None or not state.live:
-            return None
-        now = time.time()
-        whole, left = seconds_left_in_job(state, now), seconds_left(state, now)
-        parts = [f"about {_minutes(left)} left in this step"] if left is not None else []
-        parts += [f"about {_minutes(whole)} in all"] if whole is not None else []
-        names = [step.name for step in state.plan]
-        at = names.index(state.step) if state.step in names else -1
-        return {
-            "title": state.title,
-            "left": ", ".join(parts) or "time left: not measured yet",
-            "steps": [["✓" if i < at else "●" if i == at else "·", name] for i, name in enumerate(names)]
-            if at >= 0
-            else [["●", state.step or "starting"]],
-            "message": state.message,
-            "share": state.fraction,
-        }
+    def _job_controls(self) -> list[dict[str, Any]]:
+        """Describe the running job."""
+        form, state = Form(), None if self.session is None else self.session.jobs.state()
+        if state is not None and state.live:
+            now, step = time.time(), state.step or "starting"
+            left = {"left in this step": seconds_left(state, now), "in all": seconds_left_in_job(state, now)}
+            known = [f"about {_minutes(seconds)} {what}" for what, seconds in left.items() if seconds is not None]
+            form.note(f"{state.title}: {', '.join(known) or 'time left: not measured yet'}", name="job")
+            form.progress("job_share", state.fraction)
+            planned = [one.name for one in state.plan]
+            names = planned if step in planned else [step]
+            for number, name in enumerate(names, -names.index(step)):
+                mark, message = "✓" if number < 0 else "●" if number == 0 else "·", state.message if number == 0 else ""
+                form.note(f"{mark} {name}{message and ': '}{message}", name=f"job_{name}")
+            form.button("cancel_job", "Cancel", self.cancel_job)
+        return form.controls
 
     def cancel_job(self) -> None:
         """Interrupt the running job."""

@@ -122,6 +122,10 @@ class Form:
         self._handle(name, checked, work)
         self.while_dragged(name, work)
 
+    def progress(self, name: str, share: float) -> None:
+        """Add a progress bar; `share` is in [0, 1]."""
+        self._add("progress", name, value=round(share, 3))
+
     def links(self, name: str, links: Sequence[tuple[str, str, str | None, str]]) -> None:
         """Add files: name, remark, address to open or None, address to download or an empty string."""
         if links:

@@ -10,7 +10,7 @@ import json
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,30 +33,31 @@ _IN_MEMORY = 20
 
 @dataclass(frozen=True)
 class History:
-    """Names of the current state, the earlier states and the undone states."""
+    """Names of all states in order, undone ones last."""
 
-    present: str
-    """Current state."""
-    past: tuple[str, ...] = ()
-    """Earlier states, oldest first."""
-    future: tuple[str, ...] = ()
-    """Undone states, the most recently undone last."""
+    names: tuple[str, ...]
+    """Names, oldest first."""
+    at: int = 0
+    """Position of the current state."""
+
+    @property
+    def present(self) -> str:
+        """Name of the current state."""
+        return self.names[self.at]
+
+    @property
+    def undone(self) -> int:
+        """Number of undone states."""
+        return len(self.names) - 1 - self.at
 
     def pushed(self, name: str) -> "History":
         """Return the history after a new step; undone states are discarded."""
-        return History(name, (*self.past, self.present))
+        return History((*self.names[: self.at + 1], name), self.at + 1)
 
-    def undone(self) -> "History":
-        """Go one step back; return the same object if impossible."""
-        if not self.past:
-            return self
-        return History(self.past[-1], self.past[:-1], (*self.future, self.present))
-
-    def redone(self) -> "History":
-        """Go one step forward; return the same object if impossible."""
-        if not self.future:
-            return self
-        return History(self.future[-1], (*self.past, self.present), self.future[:-1])
+    def moved(self, steps: int) -> "History":
+        """Go forward by a number of steps, or back by a negative one; return the same object if impossible."""
+        at = self.at + steps
+        return replace(self, at=at) if 0 <= at < len(self.names) else self
 
 
 class StateStore:
@@ -100,9 +101,9 @@ class StateStore:
         """Read the history and delete unused states; return None if it is missing or damaged."""
         try:
             found = json.loads((self._folder / _HISTORY_FILE).read_text(encoding="utf-8"))
-            history = History(found["present"], tuple(found["past"]), tuple(found["future"]))
-            used = {self._file(name) for name in (history.present, *history.past, *history.future)}
-        except (OSError, ValueError, KeyError, TypeError):
+            history = History(tuple(found["names"]), found["at"])
+            used = {self._file(name) for name in (history.present, *history.names)}
+        except (OSError, ValueError, LookupError, TypeError):
             return None
         if not all(path.is_file() for path in used):
             return None
@@ -137,7 +138,7 @@ def _to_json(state: EditState, project_folder: Path) -> dict[str, Any]:
         "light": light_to_json,
         "weights": asdict,
     }
-    return _converted({field.name: getattr(state, field.name) for field in fields(state)}, convert)
+    return _converted(vars(state), convert)
 
 
 def _from_json(content: dict[str, Any], project_folder: Path) -> EditState:

@@ -135,11 +135,9 @@ class _Computing:
 
     def __init__(self, project: Project, out: IO[bytes]) -> None:
         self._stamps = stamps_of(project.file)
-        files = project.files()
-        assert files is not None
         self._project, self._out = project, out
         self._lock = threading.Lock()
-        self._scenes = SceneCache(files)
+        self._scenes = SceneCache(project.files())
         self._relighting = RelitPreview(self._scenes)
         self._drafts = LatestOnlyWorker(self._draft, self._failed)
         self._lights = LatestOnlyWorker(self._light, self._failed)
@@ -148,9 +146,7 @@ class _Computing:
     def take(self, number: int, changed: dict[str, Any], wanted: Wanted) -> None:
         stamps = stamps_of(self._project.file)
         if stamps != self._stamps:
-            files, self._stamps = self._project.files(), stamps
-            if files is not None:
-                self._scenes.files = files
+            self._scenes.files, self._stamps = self._project.files(), stamps
         self._number, self._state = number, replace(self._state, **changed)
         self._drafts.submit((number, self._state, wanted))
 

@@ -265,7 +265,7 @@ class Pictures:
 
     def __init__(self, scenes: SceneCache) -> None:
         """Start without a lit scene."""
-        self._scenes, self.lit, self._memo = scenes, LitScenes(scenes), Memo()
+        self._scenes, self.lit = scenes, LitScenes(scenes)
         self._drawing = threading.Lock()
 
     def draw(self, kind: Kind, state: EditState, camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
@@ -329,8 +329,7 @@ class Pictures:
             if len(given.inside) or len(given.outside) or given.box is not None:
                 size, here = self.source_photo(index)[1], small.sizes[index].tolist()
                 prompts[index] = given.scaled(here[0] / size[0], here[1] / size[1])
-        # not in the scenes' memo, because pictures would wait for its lock
-        selected, _ = self._memo.get(
+        selected, _ = self._scenes.derive(
             "seed", (scene, state.prompts), lambda: seed_selection(scene, small, prompts=prompts)
         )
         lifted = view_operator(scene, small[photo], RenderOptions()).blend(selected.float()[:, None])[..., 0]

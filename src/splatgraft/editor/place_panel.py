@@ -36,7 +36,6 @@ from splatgraft.editor.stream import View
 from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
 from splatgraft.project.layout import Side
 from splatgraft.project.placement import ObjectPlacement
-from splatgraft.runtime.memo import Memo
 from splatgraft.segmentation import Box
 
 if TYPE_CHECKING:
@@ -59,7 +58,6 @@ class PlacePanel(Panel):
         self._chosen, self._snaps, self._path, self._known_cm = 0, False, "", 0.0
         self._drag: tuple[int, DragMode, tuple[float, float], Drag] | None = None
         self._box: Box | None = None
-        self._solid = Memo()
 
     def leave(self) -> None:
         """End drags and remove the box."""
@@ -266,10 +264,9 @@ class PlacePanel(Panel):
         """Describe the outlines by which objects are dragged, and the box to erase in."""
         items, scenes, hulls = self.editor.shown_state().objects or (), self.session.scenes, []
         for item in items:
-            # without the object's base and the scenes' memo, for which the first picture would wait
             path = scenes.object_path(item)
             one = scenes.gaussians(path)
-            solid = self._solid.get(str(path), (one,), lambda one=one: one.means[one.opacities > _MIN_OPACITY])
+            solid = scenes.derive(f"solid {path}", (one,), lambda one=one: one.means[one.opacities > _MIN_OPACITY])
             hulls.append(outline(item.target_from_object.points(solid), camera))
         over: dict[str, Any] = {"hulls": hulls, "chosen": self._chosen if len(items) > 1 else -1}
         if self._box is not None:

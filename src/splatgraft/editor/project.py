@@ -105,10 +105,8 @@ class Project:
         """Folder of all results."""
         return self.file.parent if self.out is None else self.out
 
-    def files(self) -> ProjectFiles | None:
-        """Read the project's files; None if project.toml does not exist yet."""
-        if not self.file.is_file():
-            return None
+    def files(self) -> ProjectFiles:
+        """Read the project's files; raise ValueError if project.toml does not exist or is invalid."""
         flow = read_flow(self.file, self.out)
         layout = flow.layout
         segment, compose, relight = (flow.steps[name] for name in ("segment", "compose", "relight"))

@@ -34,11 +34,8 @@ class SceneCache:
 
     def __init__(self, files: ProjectFiles) -> None:
         """Start empty."""
-        self.files = files
-        self._contents: dict[tuple[str, Path], tuple[tuple[int, int], Any]] = {}
-        self._derived = Memo()
-        self._lock = threading.RLock()
-        self._file_locks: dict[tuple[str, Path], threading.RLock] = {}
+        self.files, self._memo = files, Memo()
+        self._locks: dict[str, threading.RLock] = {}
 
     def gaussians(self, path: Path) -> Gaussians:
         """Read the scene in a file."""
@@ -129,17 +126,12 @@ class SceneCache:
 
     def derive(self, name: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
         """Return the memoised result of `make`, computed again when one of `inputs` is another object."""
-        with self._lock:
-            return self._derived.get(name, inputs, make)
+        # one lock per name, so that nothing else waits for a computation or a large file
+        with self._locks.setdefault(name, threading.RLock()):
+            return self._memo.get(name, inputs, make)
 
     def _read(self, kind: str, path: Path, read: Callable[[Path], Any]) -> Any:
-        # one lock per file, so that other files can be read while a large scene loads
-        with self._file_locks.setdefault((kind, path), threading.RLock()):
-            stamp, cached = _stamp(path), self._contents.get((kind, path))
-            if cached is None or cached[0] != stamp:
-                cached = (stamp, read(path))
-                self._contents[kind, path] = cached
-            return cached[1]
+        return self.derive(f"{kind} {path}", _stamp(path), lambda: read(path))
 
 
 def _stamp(path: Path) -> tuple[int, int]:

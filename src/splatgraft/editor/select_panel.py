@@ -18,7 +18,6 @@ from splatgraft.editor.picking import Ray, Rectangle, brush_selection, in_rectan
 from splatgraft.editor.state import EditState
 from splatgraft.editor.stream import View
 from splatgraft.editor.worker import LatestOnlyWorker
-from splatgraft.runtime.memo import Memo
 from splatgraft.segmentation import Box, Keep, default_box
 
 if TYPE_CHECKING:
@@ -47,7 +46,6 @@ class SelectPanel(Panel):
         self._brush_size = 0.1
         self._stroke: list[Ray] = []
         self._touched: Tensor | None = None
-        self._memo = Memo()
         self._finder = LatestOnlyWorker(self._find_outline, lambda error: editor.say(str(error), bad=True))
 
     def close(self) -> None:
@@ -146,7 +144,7 @@ class SelectPanel(Panel):
         state = self.session.state
         if not state.prompts or state.mask_source not in _TAKES_POINTS:
             return []
-        found = self._memo.get("outlines by photo", (state.prompts,), dict)
+        found = self.session.scenes.derive("outlines by photo", (state.prompts,), dict)
         if photo not in found:
             found[photo] = []
             self._finder.submit((state, photo, found))

@@ -1,7 +1,6 @@
 """An open project: its edits with undo history, saved after every change, and its scenes and job."""
 
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,12 +40,9 @@ class Session:
         """Open the project with the edits and the undo history of the last session.
 
         Raises:
-            ValueError: If project.toml is missing, or one of the files of the edits is invalid.
+            ValueError: If project.toml is missing or invalid, or one of the files of the edits.
         """
-        files = project.files()
-        if files is None:
-            raise ValueError(f"{project.file}: expected a project, found none")
-        self.project = project
+        files, self.project = project.files(), project
         self.scenes = SceneCache(files)
         self.pictures = Pictures(self.scenes)
         self.jobs = Jobs(files.root / EDITOR_FOLDER)
@@ -54,11 +50,11 @@ class Session:
         self._stamps = stamps_of(files.file)
         self.state: EditState = read_state(files.file)
         """The current edits; `change` replaces them."""
-        self.unsaved: str | None = None
-        """Reason why edits cannot be saved; None if they can."""
+        self.is_unsaved = False
+        """Whether the disk is full, so that edits cannot be saved."""
         saved, now = self._store.read_history(), self._store.name(self.state)
         # a change of the files while no editor was open is one more step
-        self.history = History(now) if saved is None else saved if saved.present == now else saved.pushed(now)
+        self.history = History((now,)) if saved is None else saved if saved.present == now else saved.pushed(now)
         self._lock = threading.RLock()
         self.save_again()
 
@@ -76,9 +72,9 @@ class Session:
             except (ValueError, OSError) as error:
                 if not is_disk_full(error):
                     raise
-                self.unsaved = "Disk full: nothing can be saved"
+                self.is_unsaved = True
                 return False
-            self.unsaved = None
+            self.is_unsaved = False
             return True
 
     def change(self, state: EditState) -> None:
@@ -95,13 +91,14 @@ class Session:
             if name != self.history.present:
                 self._apply(self.history.pushed(name), state)
 
-    def undo(self) -> bool:
-        """Go back by one step; return False if there was no step. Raises as `change`."""
-        return self._step(History.undone)
-
-    def redo(self) -> bool:
-        """Go forward by one step; return False if there was no step. Raises as `change`."""
-        return self._step(History.redone)
+    def step(self, by: int) -> bool:
+        """Undo the last step (-1) or redo the next one (1); return False if there is none. Raises as `change`."""
+        with self._lock:
+            history = self.history.moved(by)
+            if history is self.history:
+                return False
+            self._apply(history, self._store.read(history.present))
+            return True
 
     def reload(self) -> bool:
         """Load changes made outside the editor in one undo step; return whether there were any.
@@ -112,9 +109,8 @@ class Session:
             stamps = stamps_of(self.files.file)
             if stamps == self._stamps:
                 return False
-            state, files = read_state(self.files.file), self.project.files()
-            self.state, self._stamps = state, stamps
-            self.scenes.files = files or self.files
+            self.state, self.scenes.files = read_state(self.files.file), self.project.files()
+            self._stamps = stamps
             name = self._store.save(self.state)
             if name != self.history.present:
                 self._save_history(self.history.pushed(name))
@@ -129,15 +125,7 @@ class Session:
             self._refuse_outside_changes()
             self.project.set_keys(side, keys)
             self._stamps = stamps_of(self.files.file)
-            self.scenes.files = self.project.files() or self.files
-
-    def _step(self, move: Callable[[History], History]) -> bool:
-        with self._lock:
-            history = move(self.history)
-            if history is self.history:
-                return False
-            self._apply(history, self._store.read(history.present))
-            return True
+            self.scenes.files = self.project.files()
 
     def _apply(self, history: History, state: EditState) -> None:
         self._refuse_outside_changes()

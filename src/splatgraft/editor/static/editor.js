@@ -118,7 +118,6 @@ function showPanel(found) {
   }
   $("more").hidden = !found.controls.some((one) => one.more);
   showTools(found.tools || []);
-  showJob(found.job);
   if (found.offer && offered !== null && found.offer.n > offered) element("a", { href: found.offer.url, download: found.offer.name }).click();
   offered = found.offer ? found.offer.n : 0;
   document.body.dataset.step = step ? step[0] : "";
@@ -193,6 +192,7 @@ const KINDS = {
     make: makeDrawing,
     update: (made, one) => { if (!made.dataset.busy && made.dataset.svg !== one.svg) { made.innerHTML = one.svg; made.dataset.svg = one.svg; } },
   },
+  progress: { make: () => element("progress", { max: 1 }), update: (made, one) => { made.value = one.value || 0; } },
   links: { make: () => element("div"), update: (made, one) => made.replaceChildren(...one.options.map(linkLine)) },
 };
 
@@ -308,19 +308,6 @@ function showTools(tools) {
 function setMode(name) {
   mode = name;
   showTools(panel.tools || []);
-}
-
-function showJob(job) {
-  const place = $("job");
-  place.hidden = !job;
-  if (!job) return;
-  if (!place.firstChild) place.append(element("b"), element("div"), element("progress", { max: 1 }), element("div"), element("button", { textContent: "Cancel", onclick: () => send("do", { id: "cancel_job" }) }));
-  const [title, left, bar, steps, cancel] = place.children;
-  title.textContent = job.title;
-  left.textContent = job.left;
-  bar.value = job.share;
-  steps.replaceChildren(...job.steps.map(([mark, name]) => element("div", { textContent: `${mark} ${name}${mark === "●" && job.message ? `: ${job.message}` : ""}` })));
-  cancel.disabled = !panel.editing;
 }
 
 // the pointer on the view
