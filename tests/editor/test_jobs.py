@@ -6,7 +6,7 @@ import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import patch
+from unittest.mock import MagicMock, patch
 
 import pytest
 from small_transfer import write_transfer
@@ -142,11 +142,11 @@ def result(tmp_path: Path) -> Session:
 
 def written(session: Session, kind: str, part: str) -> tuple[Path, JobState]:
     """Do the work of a job's process in this one."""
-    shared, layer = sharing.SHARE_KINDS[kind], sharing.PARTS[part]
-    to = sharing.export_path(session.files, shared, layer)
+    layer = sharing.PARTS[part]
+    to = sharing.export_path(session.files, kind, layer)
     to.parent.mkdir(parents=True, exist_ok=True)
     session.jobs.folder.mkdir(parents=True, exist_ok=True)
-    words = session.project.export_words(to, page=shared.page, layer=layer)
+    words = session.project.export_words(to, layer)
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     status = editor_jobs.main([str(session.jobs.folder), "Write it", *words])
     for number, handler in zip((signal.SIGINT, signal.SIGTERM), handlers, strict=True):
@@ -181,9 +181,9 @@ def test_what_cannot_be_written_is_the_error_of_the_job(result: Session) -> None
 
 
 def test_missing_results_and_packages_are_said(result: Session, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert {kind.suffix for kind in sharing.SHARE_KINDS.values()} == set(EXPORT_SUFFIXES)
-    page, report = (sharing.SHARE_KINDS[name] for name in ("Page to look at (.html)", "Report as one page (.html)"))
-    assert "no report yet" in (sharing.why_not(result.files, report) or "")
+    assert set(sharing.SHARE_KINDS.values()) == set(EXPORT_SUFFIXES)
+    page = next(iter(sharing.SHARE_KINDS))
+    assert "no report yet" in (sharing.why_not(result.files, sharing.REPORT) or "")
     result.files.result.unlink()
     # the light transfer alone can be shared before consolidation
     assert sharing.step_shown(result.files, is_report=False) == "relight"
@@ -191,7 +191,7 @@ def test_missing_results_and_packages_are_said(result: Session, monkeypatch: pyt
     result.files.relit.unlink()
     assert "no result yet" in (sharing.why_not(result.files, page) or "")
     monkeypatch.setattr(sharing, "find_spec", lambda name: None)
-    optional = next(kind for kind in sharing.SHARE_KINDS.values() if kind.module is not None)
+    optional = "Scene, small (.spz)"
     assert "pip install 'splatgraft[" in (sharing.why_not(result.files, optional) or "")
 
 
@@ -218,4 +218,5 @@ def test_the_first_stale_step_is_named(result: Session, monkeypatch: pytest.Monk
     assert why(relight="options changed", render="waits for relight", consolidate="waits for render") == (
         "relight: options changed"
     )
-    assert why(project="project.toml: expected TOML") == "project.toml: expected TOML"
+    monkeypatch.setattr(Project, "reasons", MagicMock(side_effect=ValueError("project.toml: expected TOML")))
+    assert result.why_stale("consolidate") == "project.toml: expected TOML"

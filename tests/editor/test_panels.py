@@ -15,7 +15,6 @@ from waiting import wait_until
 
 from splatgraft.cli import main
 from splatgraft.editor.editor import Editor
-from splatgraft.editor.light_process import Lit
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import RelitPreview
 from splatgraft.editor.session import Session
@@ -279,7 +278,7 @@ def test_a_missing_mask_is_said_and_the_photo_is_shown(finished_project: Path, t
     masks[2].unlink()
     with opened_editor(folder / "project.toml") as editor, Client(editor.server.port).window(size=(300, 200)) as window:
         window.step("Select")
-        window.says(f"Mask {masks[2].name} is missing.")
+        window.says(f"Missing masks: {masks[2].name}.")
         window.shows("Select")
         assert not window.head["problem"]
         assert window.pixels.std() > 5
@@ -314,10 +313,10 @@ def test_sliders_weigh_the_layers_of_the_transfer_that_is_there(project: Path, m
     # the process starts for seconds; test_view.py waits for it
     monkeypatch.setattr("splatgraft.editor.editor.LightProcess", MagicMock())
     with opened_editor(project) as editor, Client(editor.server.port).window(size=(160, 120)) as window:
-        session, pictures = editor.require_session(), editor.pictures
-        assert pictures is not None
+        session = editor.require_session()
+        pictures = session.pictures
         relit = RelitPreview(session.scenes).relit(session.placed_state())
-        pictures.lit.add(session.placed_state(), Lit("final", relit))
+        pictures.lit.add(session.placed_state(), "final", relit)
         window.step("Light")
         assert {name: window.control(name).get("value", 0.0) for name in asdict(LayerWeights())} == asdict(
             LayerWeights()

@@ -20,7 +20,7 @@ from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor import relit_preview
-from splatgraft.editor.light_process import LightProcess, Lit
+from splatgraft.editor.light_process import LightProcess
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import CoarseGaussians, Draft, RelitPreview, coarse_draft, coarsen
@@ -65,10 +65,10 @@ def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Ses
         picture = pictures.draw(kind, state, camera)
         assert picture.shape == (camera.height, camera.width, 3)
         assert picture.std() > 1, kind
-    pictures.lit.add(state, Lit("final", light))
+    pictures.lit.add(state, "final", light)
     assert pictures.lit.stage(state) == "final"
     # a draft that comes late does not replace it
-    pictures.lit.add(state, Lit("draft", light))
+    pictures.lit.add(state, "draft", light)
     assert pictures.lit.stage(state) == "final"
     assert pictures.lit.stage(moved(state)) == ""
 
@@ -77,7 +77,7 @@ def test_a_moved_object_keeps_its_colours_over_a_contact_shadow_until_its_light_
     session: Session, light: Relit
 ) -> None:
     lit, state = Pictures(session.scenes).lit, session.placed_state()
-    lit.add(state, Lit("final", light))
+    lit.add(state, "final", light)
     before, is_object = light.bake(state.weights)
     assert lit.scene(state) is lit.scene(state)
     assert torch.equal(lit.scene(state).sh, before.sh)
@@ -176,9 +176,9 @@ def test_the_shown_object_without_light_equals_what_the_step_writes(session: Ses
 
 @pytest.mark.long
 def test_the_light_process_makes_drafts_of_what_is_asked_last(session: Session) -> None:
-    answers: Queue[tuple[EditState, Lit]] = Queue()
+    answers: Queue[tuple[EditState, str, Relit | Draft]] = Queue()
     errors = MagicMock()
-    process = LightProcess(Project(session.files.file), lambda state, lit: answers.put((state, lit)), errors)
+    process = LightProcess(Project(session.files.file), lambda *answer: answers.put(answer), errors)
     try:
         state = session.placed_state()
         process.want(state, "prepared")
@@ -189,18 +189,18 @@ def test_the_light_process_makes_drafts_of_what_is_asked_last(session: Session) 
         while received[-1][0] is not places[-1]:
             received.append(answers.get(timeout=120))
         assert len(received) < len(places)  # places that were left while a draft was made have none
-        assert not any(shown is state for shown, _ in received)  # what is only prepared is not sent
-        shown, lit = received[-1]
-        assert lit.stage == "draft"
-        assert isinstance(lit.layers, Draft)
-        assert lit.layers.relit.gaussians.count == 0
+        assert not any(shown is state for shown, *_ in received)  # what is only prepared is not sent
+        shown, stage, layers = received[-1]
+        assert stage == "draft"
+        assert isinstance(layers, Draft)
+        assert layers.relit.gaussians.count == 0
         expected = RelitPreview(session.scenes).draft(shown).of_all(session.scenes.composite(shown))
         scenes = Pictures(session.scenes).lit
-        scenes.add(shown, lit)
+        scenes.add(shown, "draft", layers)
         drawn = scenes.scene(shown)
         assert torch.equal(drawn.means, expected.bake(shown.weights)[0].means)
         process.want(shown, "final")
-        stages = [answers.get(timeout=120)[1].stage for _ in range(2)]
+        stages = [answers.get(timeout=120)[1] for _ in range(2)]
         assert stages[-1] == "final"
     finally:
         process.close()

@@ -217,10 +217,9 @@ def lit(project: Path) -> Iterator[tuple[Editor, Client]]:
 
 def same_picture(editor: Editor, window: Client, tolerance: float) -> None:
     """Assert that the picture at rest is the renderer's own, scaled."""
-    view, pictures = editor.editing(), editor.pictures
+    view, pictures = editor.editing(), editor.require_session().pictures
     window.settled(242 if window.pixels.shape[1] != 242 else 240, 160)
     assert view is not None
-    assert pictures is not None
     orbit = editor.orbit(view)
     assert orbit is not None
     height, width = window.pixels.shape[:2]
@@ -232,8 +231,8 @@ def test_pictures_of_orbit_drag_and_release_are_the_renderer_s_and_end_as_the_st
     lit: tuple[Editor, Client],
 ) -> None:
     editor, window = lit
-    session, pictures = editor.require_session(), editor.pictures
-    assert pictures is not None
+    session = editor.require_session()
+    pictures = session.pictures
     same_picture(editor, window, 2.0)  # JPEG of quality 92
     # moving pictures have a canvas's shape, and end with a full one
     count = len(window.heads)

@@ -22,13 +22,14 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.editor.form import Form
 from splatgraft.editor.jobs import JobState, seconds_left, seconds_left_in_job
 from splatgraft.editor.light_panel import LightPanel
-from splatgraft.editor.light_process import LightProcess, Lit
+from splatgraft.editor.light_process import LightProcess, Stage
 from splatgraft.editor.open_panel import OpenPanel
 from splatgraft.editor.orbit import FreeSpace, Orbit, through, typical_distance
 from splatgraft.editor.panel import Panel, Pointer
-from splatgraft.editor.pictures import Kind, Pictures
+from splatgraft.editor.pictures import Kind
 from splatgraft.editor.place_panel import PlacePanel
 from splatgraft.editor.project import Project
+from splatgraft.editor.relit_preview import Draft
 from splatgraft.editor.result_panels import RunPanel, SharePanel
 from splatgraft.editor.select_panel import SelectPanel
 from splatgraft.editor.server import Server, Window
@@ -38,6 +39,7 @@ from splatgraft.editor.state import EditState, Stamps, stamps_of
 from splatgraft.editor.stream import Stream, View
 from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.project.layout import Side
+from splatgraft.relighting import Relit
 from splatgraft.runtime.files import is_disk_full, os_error_line
 
 KINDS: dict[str, Kind] = {
@@ -146,11 +148,6 @@ class Editor:
         if self.session is None:
             raise ValueError("Start a project first.")
         return self.session
-
-    @property
-    def pictures(self) -> Pictures | None:
-        """Pictures of the open project."""
-        return None if self.session is None else self.session.pictures
 
     def shown_state(self) -> EditState:
         """Return the state of the current drag, or the saved state."""
@@ -336,9 +333,9 @@ class Editor:
         elif self.stream.is_at_rest(_IDLE_SECONDS):
             self._light.want(state, "prepared")
 
-    def _lit(self, state: EditState, lit: Lit) -> None:
-        if self.pictures is not None and self._is_open:
-            self.pictures.lit.add(state, lit)
+    def _lit(self, state: EditState, stage: Stage, layers: Relit | Draft) -> None:
+        if self.session is not None and self._is_open:
+            self.session.pictures.lit.add(state, stage, layers)
             self.stream.touch()
             if self.live is None:
                 self.refresh()

@@ -120,7 +120,7 @@ class LightPanel(Panel):
         if not session.objects() or not session.files.transfers_light:
             return None
         state = self.editor.shown_state()
-        relit = self.pictures.lit.relit(state)
+        relit = self.session.pictures.lit.relit(state)
         light = state.light if state.light is not None or relit is None else relit.light
         self._chosen = 0 if light is None else min(self._chosen, max(0, len(light.sources) - 1))
         return light
@@ -132,7 +132,7 @@ class LightPanel(Panel):
             return "The light transfer is off in project.toml: the object is shown as it was captured."
         if not session.objects():
             return "No object is placed yet: see Place."
-        relit = self.pictures.lit.relit(session.placed_state())
+        relit = self.session.pictures.lit.relit(session.placed_state())
         return "Estimating the light." if relit is None else " ".join(one.text for one in relit.report)
 
     # strengths
@@ -247,7 +247,7 @@ class LightPanel(Panel):
 
     def _add_point(self, view: View, pointer: Pointer) -> None:
         session, state = self.session, self.session.placed_state()
-        scene = self.pictures.lit.place(state)
+        scene = self.session.pictures.lit.place(state)
         x, y, z = self.surface_under(pointer, view, scene)[0].tolist()
         points = (*self._kept(), (x, y, z))
         if len(points) % 2:

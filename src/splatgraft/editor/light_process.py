@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, Literal, get_args
 
@@ -25,6 +25,7 @@ from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.relighting import Relit
 
 Stage = Literal["draft", "refined", "final"]
+"""Draft, all layers with the sources found before a move, or the step's result."""
 Wanted = Literal["prepared", "draft", "final"]
 """Kinds of requests: prepare drafts when idle, compute a draft, or compute a draft and the final light."""
 _NICE = 10  # priority below that of pictures, also while modules load
@@ -39,23 +40,16 @@ _SETTLE_SECONDS = 0.2  # time without a request before the light starts, which c
 _REMEMBERED = 500  # stored requests; each picture of a drag makes one, and a draft may take long
 
 
-@dataclass(frozen=True)
-class Lit:
-    """Layers of the light transfer for one state."""
-
-    stage: Stage
-    """Draft, all layers with the sources found before a move, or the step's result."""
-    layers: Relit | Draft
-    """Layers, without the Gaussians if it is a draft, which are those of the composite."""
-
-
 class LightProcess:
     """The editor's side, which requests the light of the newest state and receives the results."""
 
     def __init__(
-        self, project: Project, on_lit: Callable[[EditState, Lit], None], on_error: Callable[[str], None]
+        self,
+        project: Project,
+        on_lit: Callable[[EditState, Stage, Relit | Draft], None],
+        on_error: Callable[[str], None],
     ) -> None:
-        """Start no process yet."""
+        """Start no process yet; `on_lit` gets the layers of a draft without its Gaussians, those of the composite."""
         self._project, self._on_lit, self._on_error = project, on_lit, on_error
         self._child: subprocess.Popen[bytes] | None = None
         self._sent: dict[str, Any] = {}
@@ -115,15 +109,15 @@ class LightProcess:
         assert child.stdout is not None
         with child.stdout:
             while (answer := _read(child.stdout)) is not None:
-                number, result = answer
+                number, stage, result = answer
                 with self._lock:
                     state, is_current = self._asked.get(number), child is self._child
                 if not is_current or state is None:
                     continue
-                if isinstance(result, str):
+                if stage == "failed":
                     self._on_error(result)
                 else:
-                    self._on_lit(state, result)
+                    self._on_lit(state, stage, result)
         with self._lock:
             if child is self._child:
                 # the next `want` repeats the last request
@@ -177,13 +171,12 @@ class _Computing:
         if self._lights.wait_idle(_SETTLE_SECONDS) and number == self._number:
             self._relighting.prepare_drafts(state)
 
-    def _send(self, number: int, stage: Stage, layers: Relit | Draft) -> None:
+    def _send(self, number: int, stage: Stage | Literal["failed"], result: Relit | Draft | str) -> None:
         with self._lock:
-            _write(self._out, (number, Lit(stage, layers)))
+            _write(self._out, (number, stage, result))
 
     def _failed(self, error: Exception) -> None:
-        with self._lock:
-            _write(self._out, (self._number, " ".join(str(error).split()) or type(error).__name__))
+        self._send(self._number, "failed", " ".join(str(error).split()) or type(error).__name__)
 
 
 def _without_evidence(relit: Relit) -> Relit:

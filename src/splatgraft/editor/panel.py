@@ -19,7 +19,6 @@ from splatgraft.editor.drag import Corner, on_canvas
 from splatgraft.editor.form import Form
 from splatgraft.editor.jobs import JobState
 from splatgraft.editor.picking import Ray, first_surface_hit
-from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.session import Session
 from splatgraft.editor.stream import View
 from splatgraft.segmentation import Box
@@ -82,11 +81,6 @@ class Panel:
     def _sets(self, name: str) -> Callable[[Any], None]:
         """Return the handler of a control that sets a field of this panel."""
         return partial(setattr, self, name)
-
-    @property
-    def pictures(self) -> Pictures:
-        """Pictures of the open project."""
-        return self.session.pictures
 
     def camera(self, view: View) -> Cameras:
         """Return the camera of a window's full picture; raise ValueError if it shows no scene."""

@@ -15,21 +15,16 @@ _CUTOFF_SIGMAS = 3.0
 """Distance from its centre, in standard deviations, beyond which a Gaussian does not occlude a ray."""
 
 
-@dataclass(frozen=True)
-class Rectangle:
-    """A part of the image, in fractions of its width and height from the upper left corner."""
+def in_rectangle(
+    means: Float[Tensor, "n 3"], camera: Cameras, *, lower: tuple[float, float], upper: tuple[float, float]
+) -> Bool[Tensor, "n"]:
+    """Flag the centres that project into a rectangle of one camera's image, even occluded ones.
 
-    lower: tuple[float, float]
-    """Left and upper edge."""
-    upper: tuple[float, float]
-    """Right and lower edge."""
-
-
-def in_rectangle(means: Float[Tensor, "n 3"], camera: Cameras, rectangle: Rectangle) -> Bool[Tensor, "n"]:
-    """Flag the centres that project into the rectangle in one camera, even occluded ones."""
+    `lower` is its upper left corner, `upper` its lower right one, over the image's width and height.
+    """
     pixels, depth = camera.project(means)
     share = pixels / camera.sizes[0].to(means)
-    inside = (share >= torch.tensor(rectangle.lower)) & (share <= torch.tensor(rectangle.upper))
+    inside = (share >= torch.tensor(lower)) & (share <= torch.tensor(upper))
     return inside.all(1) & (depth > 0)
 
 

@@ -23,7 +23,7 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import read_upright, resize
 from splatgraft.core.prompts import ViewPrompt
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.light_process import Lit
+from splatgraft.editor.light_process import Stage
 from splatgraft.editor.photo_view import PhotoView, prompt_of
 from splatgraft.editor.relit_preview import Draft
 from splatgraft.editor.scene_cache import SceneCache
@@ -90,15 +90,14 @@ class LitScenes:
         self._now: _LitState | None = None
         self._joined: _JoinedScene | None = None
 
-    def add(self, state: EditState, lit: Lit) -> None:
+    def add(self, state: EditState, stage: Stage, layers: Relit | Draft) -> None:
         """Store layers of the light process unless better ones are known."""
         with self._lock:
             now = self._now
-            if now is not None and now.fits(state) and _RANKS[lit.stage] < _RANKS[now.stage]:
+            if now is not None and now.fits(state) and _RANKS[stage] < _RANKS[now.stage]:
                 return
-            layers = lit.layers
             relit = layers.of_all(self._scenes.composite(state)) if isinstance(layers, Draft) else layers
-            self._now = _LitState(state, lit.stage, relit.bake, relit)
+            self._now = _LitState(state, stage, relit.bake, relit)
 
     def adopt(self, state: EditState) -> None:
         """Read the result of the step `relight`, which is up to date for a state."""

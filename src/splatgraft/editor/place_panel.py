@@ -31,7 +31,7 @@ from splatgraft.editor.placement import (
     with_base,
 )
 from splatgraft.editor.sky_dome import SkyDome
-from splatgraft.editor.state import check_state
+from splatgraft.editor.state import check_height_cm, check_state
 from splatgraft.editor.stream import View
 from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
 from splatgraft.project.layout import Side
@@ -222,7 +222,10 @@ class PlacePanel(Panel):
         self._chosen = len(objects) - 1
 
     def _resize(self, here_cm: float) -> None:
-        self._place(rescale(*self._one(), self.session.size(self._chosen).scale_at(here_cm)))
+        check_height_cm(here_cm)
+        cm_per_scale = self.session.size(self._chosen).cm_per_scale
+        assert cm_per_scale is not None
+        self._place(rescale(*self._one(), here_cm / cm_per_scale))
 
     def _set_scale(self, side: Side) -> None:
         session, cm = self.session, self._known_cm
@@ -290,7 +293,7 @@ class PlacePanel(Panel):
         mode: Any = "lift" if pointer.shift else pointer.mode
         self._chosen = index
         rest = replace(self.session.placed_state(), objects=(*objects[:index], *objects[index + 1 :]))
-        place = self.pictures.lit.pasted(rest) if rest.objects else self.pictures.lit.place(rest)
+        place = self.session.pictures.lit.pasted(rest) if rest.objects else self.session.pictures.lit.place(rest)
         held = Drag(*self._one(), self.camera(view), place, up=self.session.up())
         self._drag = (index, mode, pointer.place, held)
 

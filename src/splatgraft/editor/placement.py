@@ -10,11 +10,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from splatgraft.composition import NoFreePlaceError, ObjectBase, Placed, PlaceOptions, place_object, rest_on_surface
+from splatgraft.composition import NoFreePlaceError, ObjectBase, Placed, PlaceOptions, place_object, support_below
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.rotations import rotation_between
 from splatgraft.core.similarity import Similarity
-from splatgraft.editor.state import check_height_cm
 
 Triple = tuple[float, float, float]
 
@@ -53,13 +53,6 @@ class ObjectSize:
     cm_per_scale: float | None
     """Height in the target, cm, at a `scale` of 1."""
 
-    def scale_at(self, here_cm: float) -> float:
-        """Return the `scale` for a height in the target; raise ValueError if the target's scale is unknown."""
-        check_height_cm(here_cm)
-        if self.cm_per_scale is None:
-            raise ValueError("target: expected a capture whose scale is known, found none; see `splatgraft scale`")
-        return here_cm / self.cm_per_scale
-
 
 @dataclass(frozen=True)
 class PlaceableObject:
@@ -93,17 +86,17 @@ def suggest_placement(
 def drop_to_surface(
     target: Gaussians, item: PlaceableObject, target_from_object: Similarity, *, up: Float[Tensor, "3"]
 ) -> Similarity:
-    """Move vertically onto the surface and align with its normal; keep scale and yaw.
+    """Move vertically onto the surface, and align with its normal by the smallest rotation.
 
     Raise ValueError if there is no surface below.
     """
-    base_point = target_from_object.points(item.base.point)
+    base, scale, rotation = item.base, target_from_object.scale, target_from_object.rotation
+    up = torch.nn.functional.normalize(up, dim=0)
     # start at half the object's height: a sunk object is lifted, and surfaces above the object are ignored
-    above = base_point + 0.5 * target_from_object.scale * item.base.height * torch.nn.functional.normalize(up, dim=0)
-    straight, support = rest_on_surface(target, item.base, point=above, up=up, scale=target_from_object.scale)
-    twist = _twist_about(target_from_object.rotation @ straight.rotation.T, support.normal)
-    scale = target_from_object.scale
-    return rest_on_surface(target, item.base, point=above, up=up, scale=scale, yaw_deg=math.degrees(twist))[0]
+    above = target_from_object.points(base.point) + 0.5 * scale * base.height * up
+    support = support_below(target, above, up=up, radius=scale * base.radius)
+    upright = rotation_between(rotation @ base.up, support.normal) @ rotation
+    return with_base(item, replace(target_from_object, rotation=upright), at=support.point)
 
 
 def rescale(item: PlaceableObject, target_from_object: Similarity, scale: float) -> Similarity:
@@ -131,14 +124,13 @@ def place_beside(
     size = target_from_object.scale * item.base.height
     step = _BESIDE * target_from_object.scale * _reach(item)
     old = float(target_from_object.points(item.base.point) @ up)
-    scale = target_from_object.scale
     for turn in range(_DIRECTIONS):
         angle = 2 * math.pi * turn / _DIRECTIONS
         shift = step * (math.cos(angle) * across + math.sin(angle) * along)
         shifted = _shifted(target_from_object, shift)
         above = shifted.points(item.base.point) + 0.5 * size * up
         try:
-            support = rest_on_surface(target, item.base, point=above, up=up, scale=scale)[1]
+            support = support_below(target, above, up=up, radius=target_from_object.scale * item.base.radius)
         except ValueError:
             continue  # no surface below
         drop = float(support.point @ up) - old
@@ -157,9 +149,3 @@ def _reach(item: PlaceableObject) -> float:
 
 def _shifted(target_from_object: Similarity, shift: Float[Tensor, "3"]) -> Similarity:
     return replace(target_from_object, translation=target_from_object.translation + shift)
-
-
-def _twist_about(rotation: Float[Tensor, "3 3"], axis: Float[Tensor, "3"]) -> float:
-    """Compute the twist angle of `rotation` about unit `axis` (swing-twist decomposition), radians."""
-    i, j, k, w = Rotation.from_matrix(rotation.double().numpy()).as_quat()
-    return 2 * math.atan2(float(torch.tensor([i, j, k]) @ axis.double()), w)

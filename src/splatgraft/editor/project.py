@@ -27,11 +27,6 @@ from splatgraft.steps.relight import Relight
 from splatgraft.steps.segment import Segment
 from splatgraft.workflow.flow import read_flow, reasons
 
-ExportPage = Literal["viewer", "report"]
-"""Contents of an exported .html."""
-PROBLEM = "project"
-"""Entry of `Project.reasons` if project.toml is invalid."""
-
 
 @dataclass(frozen=True)
 class ProjectFiles:
@@ -136,11 +131,8 @@ class Project:
         )
 
     def reasons(self) -> Mapping[str, str | None]:
-        """Return why each step is stale, as in `status`, or one entry with the error if project.toml is invalid."""
-        try:
-            return reasons(read_flow(self.file, self.out))
-        except ValueError as error:
-            return {PROBLEM: str(error)}
+        """Return why each step is stale, as in `status`; raise ValueError if project.toml is invalid."""
+        return reasons(read_flow(self.file, self.out))
 
     def create(self, captures: tuple[Path, Path], *, scenes: tuple[Path | None, Path | None]) -> None:
         """Write project.toml for two captures or scene files, and for scenes trained on them if given."""
@@ -163,9 +155,9 @@ class Project:
         out = () if self.out is None else ("--out", str(self.out))
         return ("run", str(self.file), "--to", to, *out)
 
-    def export_words(self, to: Path, *, page: ExportPage, layer: Layer) -> tuple[str, ...]:
-        """Return the arguments of `splatgraft` that write the result or a part of it in the suffix's format."""
-        part = ("--page", page) if page == "report" else () if layer == "all" else ("--layer", layer)
+    def export_words(self, to: Path, layer: Layer | Literal["report"]) -> tuple[str, ...]:
+        """Return the arguments of `splatgraft` that write the result, a part of it or the report."""
+        part = () if layer == "all" else ("--page", layer) if layer == "report" else ("--layer", layer)
         return ("export", str(self.root), "--to", str(to), *part)
 
 

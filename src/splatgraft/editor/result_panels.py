@@ -81,7 +81,7 @@ class SharePanel(Panel):
     def __init__(self, editor: "Editor") -> None:
         """Start with the first kind of file and the first part."""
         super().__init__(editor)
-        self._kind = next(iter(sharing.SHARE_KINDS.values()))
+        self._kind = next(iter(sharing.SHARE_KINDS))
         self._part: Layer = "all"
         self._asked = 0
         """Process id of the job that writes a file for the window."""
@@ -89,28 +89,27 @@ class SharePanel(Panel):
     def build(self, form: Form) -> None:
         """Add the kinds of files, the command, and the list of files."""
         session, kind = self.session, self._kind
+        is_report = kind == sharing.REPORT
         why_not = sharing.why_not(session.files, kind)
-        shown = sharing.step_shown(session.files, is_report=kind.page == "report")
+        shown = sharing.step_shown(session.files, is_report=is_report)
         why = None if why_not is not None else session.why_stale(shown)
-        what = "The report" if kind.page == "report" else "The result"
+        what = "The report" if is_report else "The result"
         form.note("" if why is None else f"{what} is out of date: {why}. See Run.", name="stale", bad=True)
-        form.choice("kind_of_file", "As", kind, sharing.SHARE_KINDS, self._sets("_kind"))
+        form.choice("kind_of_file", "As", kind, {name: name for name in sharing.SHARE_KINDS}, self._sets("_kind"))
         form.note(why_not or "", name="share")
         form.button("write", "Write and download", self._start, main=True, disabled=why_not is not None)
         form.button("view_picture", "Picture of this view", self._send_picture)
         form.links("written", self._links(session))
         form.more()
-        if kind.page == "viewer":
+        if not is_report:
             hint = "Parts share the place's frame; pictures of them have alpha"
             form.choice("part", "Part", self._part, sharing.PARTS, self._sets("_part"), hint=hint)
         form.note(_command_line(self._wanted()[1]), name="command", faint=True)
 
     def _wanted(self) -> tuple[Path, tuple[str, ...]]:
         """Return the file to write and the arguments of `splatgraft` that write it."""
-        kind, session = self._kind, self.session
-        layer: Layer = self._part if kind.page == "viewer" else "all"
-        to = sharing.export_path(session.files, kind, layer)
-        return to, session.project.export_words(to, page=kind.page, layer=layer)
+        session, to = self.session, sharing.export_path(self.session.files, self._kind, self._part)
+        return to, session.project.export_words(to, "report" if self._kind == sharing.REPORT else self._part)
 
     def _start(self) -> None:
         (to, words), session = self._wanted(), self.session

@@ -14,7 +14,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.form import Form
 from splatgraft.editor.panel import CORNERS, Panel, Pointer, box_over
 from splatgraft.editor.photo_view import PhotoView, prompt_of, seen_best, with_click
-from splatgraft.editor.picking import Ray, Rectangle, brush_selection, in_rectangle, interpolate_rays
+from splatgraft.editor.picking import Ray, brush_selection, in_rectangle, interpolate_rays
 from splatgraft.editor.state import EditState
 from splatgraft.editor.stream import View
 from splatgraft.editor.worker import LatestOnlyWorker
@@ -70,7 +70,9 @@ class SelectPanel(Panel):
             return
         state, selection = session.state, session.selection()
         form.note(self._said(bool(selection is not None and selection.any())), name="selection")
-        form.note(self._missing_masks(), name="warning", bad=True)
+        masks = [path.name for path in session.scenes.missing_masks(session.files.source_cameras)]
+        more = f" and {len(masks) - 3} more" if len(masks) > 3 else ""
+        form.note(f"Missing masks: {', '.join(masks[:3])}{more}." if masks else "", name="warning", bad=True)
         marks, hint = {"the object": True, "what is beside it": False}, "Alt or the right button: what is beside it"
         form.choice("marks", "A click marks", self._marks_object, marks, self._sets("_marks_object"), hint=hint)
         editor.add_photos(form)
@@ -103,14 +105,6 @@ class SelectPanel(Panel):
             return "The object is orange. Where it is wrong, click or brush, and cut it out again."
         return "What is in the box is orange. Cut it out, or click on the object in two or three photos first."
 
-    def _missing_masks(self) -> str:
-        """Return a warning about missing masks of the capture; empty if there are none."""
-        missing = self.session.scenes.missing_masks(self.session.files.source_cameras)
-        names, more = ", ".join(path.name for path in missing[:3]), len(missing) - 3
-        if len(missing) < 2:
-            return f"Mask {names} is missing." if missing else ""
-        return f"Masks {names}{f' and {more} more' if more > 0 else ''} are missing."
-
     def tools(self) -> dict[str, Any]:
         """Offer strokes of the brush, and rectangles."""
         return {"paint": self._uses_brush, "rectangle": True}
@@ -122,7 +116,7 @@ class SelectPanel(Panel):
         which = self.session.selection()
         if self._touched is not None and which is not None:
             which = which | self._touched if self._adds else which & ~self._touched
-        return self.pictures.draw_source(which, camera, photo=view.photo, alone=self._is_alone), "full quality"
+        return self.session.pictures.draw_source(which, camera, photo=view.photo, alone=self._is_alone), "full quality"
 
     def overlay(self, view: View, camera: Cameras) -> dict[str, Any]:
         """Describe the clicks and their outline in a photo, or the box elsewhere."""
@@ -131,7 +125,7 @@ class SelectPanel(Panel):
             box = session.box()
             return {"dots": [], "lines": []} if box is None else box_over(box, camera, _ORANGE)
         name = session.scenes.cameras(session.files.source_cameras).names[view.photo]
-        (width, height), prompt = self.pictures.source_photo(view.photo)[1], prompt_of(session.state.prompts, name)
+        prompt, (width, height) = prompt_of(session.state.prompts, name), session.pictures.source_photo(view.photo)[1]
         shown, dots = PhotoView((width, height), (camera.width, camera.height)), []
         for points, color in ((prompt.inside, _GREEN), (prompt.outside, _RED)):
             at = [shown.place_of(x / width, y / height) for x, y in points.tolist()]
@@ -152,7 +146,7 @@ class SelectPanel(Panel):
 
     def _find_outline(self, asked: tuple[EditState, int, dict[int, Any]]) -> None:
         state, photo, found = asked
-        found[photo] = self.pictures.outline(state, photo)
+        found[photo] = self.session.pictures.outline(state, photo)
         self.editor.stream.touch()
 
     # the pointer
@@ -162,8 +156,9 @@ class SelectPanel(Panel):
         if pointer.what == "rectangle":
             camera = self.camera(view)
             (x, y), (u, v) = pointer.place, pointer.to
-            part = Rectangle((min(x, u), min(y, v)), (max(x, u), max(y, v)))
-            self._correct(in_rectangle(self._scene().means, camera, part), add=self._adds != pointer.alt)
+            lower, upper = (min(x, u), min(y, v)), (max(x, u), max(y, v))
+            inside = in_rectangle(self._scene().means, camera, lower=lower, upper=upper)
+            self._correct(inside, add=self._adds != pointer.alt)
         elif pointer.on in CORNERS:
             found = self.dragged_box(view, pointer, self.session.box())
             if found is not None and pointer.what == "up":
@@ -175,7 +170,7 @@ class SelectPanel(Panel):
 
     def _mark(self, view: View, pointer: Pointer) -> None:
         """Add a point to the photo in view, or to the one with the most similar direction, and show it."""
-        session, pictures = self.session, self.pictures
+        session, pictures = self.session, self.session.pictures
         cameras, photo = session.scenes.cameras(session.files.source_cameras), view.photo
         if photo is not None:
             size = pictures.source_photo(photo)[1]

@@ -15,7 +15,7 @@ from splatgraft.editor.history import History, StateStore
 from splatgraft.editor.jobs import Jobs
 from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.placement import ObjectSize, PlaceableObject
-from splatgraft.editor.project import PROBLEM, Project, ProjectFiles, in_words
+from splatgraft.editor.project import Project, ProjectFiles, in_words
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import (
     EditState,
@@ -239,9 +239,10 @@ class Session:
 
     def why_stale(self, *steps: str) -> str | None:
         """Return the original reason why one of these steps is out of date; None if all are up to date."""
-        found = self.project.reasons()
-        if PROBLEM in found:
-            return found[PROBLEM]
+        try:
+            found = self.project.reasons()
+        except ValueError as error:
+            return str(error)
         name, reason = next(((step, found[step]) for step in steps if found.get(step) is not None), ("", None))
         while reason is not None and (before := reason.removeprefix("waits for ")) in found and before != reason:
             name, reason = before, found[before]

@@ -1,44 +1,32 @@
 """Files that a project can share, with their kinds, names and parts, and those already written."""
 
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from splatgraft.editor.project import ExportPage, ProjectFiles
+from splatgraft.editor.project import ProjectFiles
 from splatgraft.exports.export import Layer
 from splatgraft.project.layout import EXPORTS_FOLDER, REPORT_FILE
 from splatgraft.runtime.optional_dependencies import extra_providing
 
-
-@dataclass(frozen=True)
-class ShareKind:
-    """One kind of file."""
-
-    suffix: str
-    """Suffix of the file, with the dot; it names the format."""
-    page: ExportPage = "viewer"
-    """Contents of an .html; the report has no parts."""
-    module: str | None = None
-    """An optional module that the format needs."""
-
-
-SHARE_KINDS: dict[str, ShareKind] = {
-    "Page to look at (.html)": ShareKind(".html"),
-    "Report as one page (.html)": ShareKind(".html", page="report"),
-    "Picture (.png)": ShareKind(".png"),
-    "Picture (.jpg)": ShareKind(".jpg"),
-    "Turntable, video (.mp4)": ShareKind(".mp4"),
-    "Turntable, animation (.webp)": ShareKind(".webp"),
-    "Turntable, animation (.gif)": ShareKind(".gif"),
-    "Scene, small (.sog)": ShareKind(".sog"),
-    "Scene, small (.spz)": ShareKind(".spz", module="zstandard"),
-    "Scene, SuperSplat (.compressed.ply)": ShareKind(".compressed.ply"),
-    "Scene, exact (.ply)": ShareKind(".ply"),
-    "Scene, old viewers (.splat)": ShareKind(".splat"),
-    "Scene, glTF (.glb)": ShareKind(".glb"),
+REPORT = "Report as one page (.html)"
+SHARE_KINDS = {
+    "Page to look at (.html)": ".html",
+    REPORT: ".html",
+    "Picture (.png)": ".png",
+    "Picture (.jpg)": ".jpg",
+    "Turntable, video (.mp4)": ".mp4",
+    "Turntable, animation (.webp)": ".webp",
+    "Turntable, animation (.gif)": ".gif",
+    "Scene, small (.sog)": ".sog",
+    "Scene, small (.spz)": ".spz",
+    "Scene, SuperSplat (.compressed.ply)": ".compressed.ply",
+    "Scene, exact (.ply)": ".ply",
+    "Scene, old viewers (.splat)": ".splat",
+    "Scene, glTF (.glb)": ".glb",
 }
-"""Kinds of files, by the label in the menu."""
-
+"""Suffixes of files, which name the format, by the label in the menu; the report has no parts."""
+_MODULES = {".spz": "zstandard"}
+"""Optional modules that formats need, by suffix."""
 PARTS: dict[str, Layer] = {
     "all": "all",
     "object alone": "object",
@@ -49,21 +37,22 @@ PARTS: dict[str, Layer] = {
 """Parts of the scene, by the label in the menu."""
 
 
-def why_not(files: ProjectFiles, kind: ShareKind) -> str | None:
-    """Return why this kind cannot be written yet, with the remedy; None if it can."""
-    if kind.module is not None and find_spec(kind.module) is None:
-        extra = extra_providing(kind.module)
-        return f"{kind.suffix}: needs a package that is not installed: pip install 'splatgraft[{extra}]'"
-    if kind.page == "report":
+def why_not(files: ProjectFiles, kind: str) -> str | None:
+    """Return why a file of this label cannot be written yet, with the remedy; None if it can."""
+    module = _MODULES.get(SHARE_KINDS[kind])
+    if module is not None and find_spec(module) is None:
+        extra = extra_providing(module)
+        return f"{SHARE_KINDS[kind]}: needs a package that is not installed: pip install 'splatgraft[{extra}]'"
+    if kind == REPORT:
         return None if has_report(files) else "There is no report yet: make it first."
     has_scene = files.result.is_file() or files.relit.is_file()
     return None if has_scene else "There is no result yet: run the transfer first."
 
 
-def export_path(files: ProjectFiles, kind: ShareKind, layer: Layer) -> Path:
+def export_path(files: ProjectFiles, kind: str, layer: Layer) -> Path:
     """Return the path of a shared file, named by the project and the part."""
-    part = "_report" if kind.page == "report" else "" if layer == "all" else f"_{layer.replace('-', '_')}"
-    return files.root / EXPORTS_FOLDER / f"{files.root.resolve().name or 'scene'}{part}{kind.suffix}"
+    part = "_report" if kind == REPORT else "" if layer == "all" else f"_{layer.replace('-', '_')}"
+    return files.root / EXPORTS_FOLDER / f"{files.root.resolve().name or 'scene'}{part}{SHARE_KINDS[kind]}"
 
 
 def has_report(files: ProjectFiles) -> bool:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import UInt8
 from PIL import Image
 
 from splatgraft.editor.orbit import Orbit
@@ -169,7 +168,8 @@ class Stream:
         start = time.monotonic()
         small = max(_LEAST, round(scale * width)), max(_LEAST, round(scale * height))
         pixels, over = self._artist.draw(view, orbit.camera(*small))
-        content = jpeg(pixels, _FULL_QUALITY if scale == 1.0 else _MOVING_QUALITY)
+        content = io.BytesIO()
+        Image.fromarray(pixels).save(content, "JPEG", quality=_FULL_QUALITY if scale == 1.0 else _MOVING_QUALITY)
         seconds = time.monotonic() - start
         if scale < 1.0 or seconds < _BUDGET_SECONDS:
             # half of the time does not depend on the size
@@ -182,11 +182,4 @@ class Stream:
             self._wake.notify_all()
         head = {"n": view.sent, "full": scale == 1.0, "split": view.split, **over}
         packed = json.dumps(head).encode()
-        view.window.send("picture", len(packed).to_bytes(4, "little") + packed + content)
-
-
-def jpeg(pixels: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
-    """Encode a picture as JPEG with a quality from 0 to 100."""
-    stream = io.BytesIO()
-    Image.fromarray(pixels).save(stream, "JPEG", quality=quality)
-    return stream.getvalue()
+        view.window.send("picture", len(packed).to_bytes(4, "little") + packed + content.getvalue())
