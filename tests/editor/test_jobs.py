@@ -14,7 +14,7 @@ from waiting import HANG_LIMIT, wait_until
 
 from splatgraft.cli import main
 from splatgraft.editor import jobs as editor_jobs
-from splatgraft.editor import sharing
+from splatgraft.editor import result_panels as sharing
 from splatgraft.editor.jobs import Jobs, JobState, seconds_left, seconds_left_in_job, write_state
 from splatgraft.editor.project import Project
 from splatgraft.editor.session import Session

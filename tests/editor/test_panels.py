@@ -74,12 +74,12 @@ def test_the_object_s_height_is_shown_and_typed_in_centimetres(editor: Editor, w
     for which in ("Scale of its photos", "Scale of the place"):
         window.do("sets", which)
         window.says("height in cm: expected a number from")
-    assert read_scale(session.files.source_cameras) is None
-    assert read_scale(session.files.target_cameras) is None
+    assert read_scale(session.files.cameras["source"]) is None
+    assert read_scale(session.files.cameras["target"]) is None
     window.do("known", [12.0])
     window.do("sets", "Scale of the place")
     window.wait(lambda: window.has("height"), what="the height")
-    found = read_scale(session.files.target_cameras)
+    found = read_scale(session.files.cameras["target"])
     assert found is not None
     assert found.metres_per_unit == pytest.approx(0.12 / (before.scale * base.height))
     assert window.control("height")["value"] == pytest.approx([12.0])
@@ -96,7 +96,7 @@ def test_the_object_s_height_is_shown_and_typed_in_centimetres(editor: Editor, w
     assert session.objects()[0].target_from_object.scale == pytest.approx(2.0 * before.scale)
     assert session.true_scale() == pytest.approx(2.0 * before.scale)
     # a broken file is named, and the rest of the step stays usable
-    path = write_scale(session.files.target_cameras, MetricScale(1.0, "a test"))
+    path = write_scale(session.files.cameras["target"], MetricScale(1.0, "a test"))
     path.write_text("{")
     editor.refresh()
     window.says(str(path))
@@ -194,7 +194,7 @@ def test_a_bad_project_file_is_said_and_opened_by_itself_once_it_is_corrected(pr
 
 def test_erased_flags_of_another_target_leave_the_page_usable(project: Path) -> None:
     session = Session(Project(project))
-    count = session.scenes.gaussians(session.files.target_scene).count
+    count = session.scenes.scene("target").count
     session.change(replace(session.placed_state(), erased=torch.arange(count) > 3))
     np.save(project.parent / "erased.npy", np.zeros(3, bool))
     with opened_editor(project) as editor, Client(editor.server.port).window(size=(64, 48)) as window:

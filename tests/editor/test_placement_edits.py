@@ -57,7 +57,7 @@ def test_gimbal_lock_gives_the_same_rotation() -> None:
 
 def test_operations_keep_what_they_do_not_change(session: Session) -> None:
     item, up = session.placeable_object(0), torch.tensor([0.0, 0.0, 1.0])
-    target = session.scenes.gaussians(session.files.target_scene)
+    target = session.scenes.scene("target")
     start = session.objects()[0].target_from_object
     turned = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.7, 0.4], [0.7, 0, 0], [-0.4, 0, 0]]))
     tilted = Similarity(scale=start.scale, rotation=turned @ start.rotation, translation=start.translation + 0.3 * up)

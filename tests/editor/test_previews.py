@@ -58,7 +58,7 @@ def light(lit: Path, tmp_path_factory: pytest.TempPathFactory) -> Relit:
 
 def test_every_kind_of_picture_is_rendered_or_refused_with_a_reason(session: Session, light: Relit) -> None:
     state, pictures = session.placed_state(), Pictures(session.scenes)
-    camera = session.scenes.cameras(session.files.target_cameras)[0]
+    camera = session.scenes.cameras("target")[0]
     with pytest.raises(ValueError, match="no result yet"):
         pictures.draw("result", state, camera)
     for kind in ("lit", "pasted", "place"):
@@ -97,7 +97,7 @@ def test_a_moved_object_keeps_its_colours_over_a_contact_shadow_until_its_light_
     assert bool((darker >= -1e-6).all())
     assert float(darker[apart > 1.0].abs().max()) < 0.02
     # the place itself is as it was
-    assert torch.equal(lit.place(state).sh, session.scenes.gaussians(session.files.target_scene).sh)
+    assert torch.equal(lit.place(state).sh, session.scenes.scene("target").sh)
 
 
 def test_a_dragged_object_stands_on_its_flattened_support_wherever_it_was_before(session: Session) -> None:
@@ -105,7 +105,7 @@ def test_a_dragged_object_stands_on_its_flattened_support_wherever_it_was_before
     grid = torch.stack(torch.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
     heights = 0.03 * torch.randn(len(grid), 1, generator=torch.Generator().manual_seed(0))  # a layer, not a sheet
     floor = surfels(torch.cat([grid, heights], 1), UP.repeat(len(grid), 1), width=0.03, thickness=0.02)
-    write_gaussians(session.files.target_scene, floor)
+    write_gaussians(session.files.scenes["target"], floor)
     lit, state = Pictures(session.scenes).lit, session.placed_state()
     item, place = session.objects()[0], lit.place(state)
     placed = item.target_from_object

@@ -49,8 +49,8 @@ def without_empty(text: bytes) -> bytes:
 
 def test_every_edit_is_saved_and_undone_also_after_a_restart(session: Session) -> None:
     assert [item.object_path for item in session.objects()] == [None]
-    target = session.scenes.gaussians(session.files.target_scene).count
-    source = session.scenes.gaussians(session.files.source_scene).count
+    target = session.scenes.scene("target").count
+    source = session.scenes.scene("source").count
     erased, corrections = torch.arange(target) % 7 == 0, (torch.arange(source) % 3 - 1).to(torch.int8)
     points = with_click(None, "a.jpg", (10.5, 20.25), on_object=True, longer_side=1000)
     steps = (
@@ -254,15 +254,15 @@ def test_settings_refuse_huge_files_and_deep_nesting_in_one_line(tmp_path: Path)
 
 def test_a_project_with_trained_scenes_names_them(session: Session, tmp_path: Path) -> None:
     made = Project(tmp_path / "new" / "project.toml")
-    captures = (session.files.source_cameras.parent, session.files.target_cameras.parent)
+    captures = (session.files.cameras["source"].parent, session.files.cameras["target"].parent)
     with pytest.raises(ValueError, match="trained scene"):
         made.create(captures, scenes=(tmp_path / "none.ply", None))
-    made.create(captures, scenes=(session.files.source_scene, None))
+    made.create(captures, scenes=(session.files.scenes["source"], None))
     files = made.files()
     assert files.has_photos("source")
     assert files.has_photos("target")
     given = read_toml(made.file)["source"]["scene"]
-    assert (made.file.parent / given).resolve() == session.files.source_scene.resolve()
+    assert (made.file.parent / given).resolve() == session.files.scenes["source"].resolve()
 
 
 def test_erased_flags_of_another_target_are_named(session: Session) -> None:

@@ -23,11 +23,10 @@ from splatgraft.core.rotations import rotation_about
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.drag import Drag, DragMode, outline
 from splatgraft.editor.editor import Editor
-from splatgraft.editor.light_panel import with_direction
+from splatgraft.editor.light_panel import SkyDome, with_direction
 from splatgraft.editor.orbit import FreeSpace, Orbit, through
 from splatgraft.editor.pictures import draw
 from splatgraft.editor.session import Session
-from splatgraft.editor.sky_dome import SkyDome
 from splatgraft.formats import read_gaussians
 from splatgraft.relighting import LightSource
 
@@ -45,9 +44,9 @@ def pixel(camera: Cameras, point: torch.Tensor) -> np.ndarray:
 
 
 def grabbed(session: Session) -> Drag:
-    camera = session.scenes.cameras(session.files.target_cameras)[0]
+    camera = session.scenes.cameras("target")[0]
     item, placed = session.placeable_object(0), session.objects()[0].target_from_object
-    return Drag(item, placed, camera, session.scenes.gaussians(session.files.target_scene), up=session.up())
+    return Drag(item, placed, camera, session.scenes.scene("target"), up=session.up())
 
 
 def foot(drag: Drag, placed: Similarity) -> torch.Tensor:
@@ -59,7 +58,7 @@ def at(drag: Drag, mode: DragMode, x: float, y: float) -> Similarity:
 
 
 def test_a_moved_object_follows_the_pointer_on_its_support(session: Session) -> None:
-    drag, camera = grabbed(session), session.scenes.cameras(session.files.target_cameras)[0]
+    drag, camera = grabbed(session), session.scenes.cameras("target")[0]
     begun = foot(drag, drag.placed)
     for dx, dy in ((0.05, 0.02), (-0.06, 0.04), (0.02, -0.03)):
         placed = at(drag, "move", 0.5 + dx, 0.5 + dy)
@@ -113,7 +112,7 @@ def test_a_lifted_turned_and_sized_object_keeps_its_foot_or_its_place(session: S
 
 
 def test_an_outline_holds_all_of_the_object(session: Session) -> None:
-    camera = session.scenes.cameras(session.files.target_cameras)[0]
+    camera = session.scenes.cameras("target")[0]
     points = session.objects()[0].target_from_object.points(session.placeable_object(0).gaussians.means)
     hull = np.array(outline(points, camera), np.float32)
     for point in points:
@@ -154,7 +153,7 @@ def test_the_camera_stays_above_the_support_and_out_of_walls() -> None:
 
 
 def test_a_photo_s_view_shows_all_of_it_on_any_canvas_and_a_turn_comes_back(session: Session) -> None:
-    camera = session.scenes.cameras(session.files.target_cameras)[2]
+    camera = session.scenes.cameras("target")[2]
     view, up = through(camera, 1.5), UP.double().numpy()
     rays = (
         torch.tensor([[0.0, 0, 1], [camera.width, 0, 1], [0, camera.height, 1]])

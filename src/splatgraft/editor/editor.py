@@ -30,12 +30,11 @@ from splatgraft.editor.pictures import Kind
 from splatgraft.editor.place_panel import PlacePanel
 from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import Draft
-from splatgraft.editor.result_panels import RunPanel, SharePanel
+from splatgraft.editor.result_panels import RunPanel, SharePanel, served_file, written_exports
 from splatgraft.editor.select_panel import SelectPanel
 from splatgraft.editor.server import Server, Window
 from splatgraft.editor.session import Session
-from splatgraft.editor.sharing import served_file, written_exports
-from splatgraft.editor.state import EditState, Stamps, stamps_of
+from splatgraft.editor.state import EditState, Stamp, check_state, stamps_of
 from splatgraft.editor.stream import Stream, View
 from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.project.layout import Side
@@ -87,7 +86,7 @@ class Editor:
         """File for the editing window to download."""
         self._light: LightProcess | None = None
         self._form = Form()
-        self._seen: Stamps = ()
+        self._seen: tuple[Stamp, ...] = ()
         self._marks: dict[str, str] = {}
         self._last_job = ""
         self._is_open = True
@@ -155,6 +154,8 @@ class Editor:
 
     def show_live(self, state: EditState | None) -> None:
         """Show a state during a drag; None shows the saved one."""
+        if state is not None:
+            check_state(state)
         self.live = state
         # a dragged object keeps its last colours until it pauses; a dragged light shows by its drafts alone
         if state is None or self.step == "Light":
@@ -297,8 +298,9 @@ class Editor:
         """Return the cameras of the shown scene; None if they or the scene do not exist yet."""
         if self.session is None:
             return None
-        scene, path = self.session.files.scene_and_cameras(self.side)
-        return self.session.scenes.cameras(path) if path.is_file() and scene.is_file() else None
+        session, side = self.session, self.side
+        is_there = all(paths[side].is_file() for paths in (session.files.cameras, session.files.scenes))
+        return session.scenes.cameras(side) if is_there else None
 
     def up(self) -> np.ndarray:
         """Return the up direction of the shown scene."""
@@ -308,7 +310,7 @@ class Editor:
         session, cameras = self.session, self.cameras()
         if session is None or cameras is None:
             return None
-        scene, objects = session.scenes.gaussians(session.files.target_scene), session.objects()
+        scene, objects = session.scenes.scene("target"), session.objects()
 
         def make() -> FreeSpace:
             foot = objects[0].target_from_object.points(session.placeable_object(0).base.point) if objects else None
@@ -320,7 +322,7 @@ class Editor:
         session = self.session
         if session is None or self._light is None or self.step == "Select" or not self.stream.views:
             return
-        if not session.files.transfers_light or not session.files.target_scene.is_file():
+        if not session.files.transfers_light or not session.files.scenes["target"].is_file():
             return
         state = self.shown_state()
         stage = session.pictures.lit.stage(state)
@@ -463,6 +465,7 @@ class Editor:
     def _do(self, view: View, message: dict[str, Any]) -> None:
         kind = message["t"]
         if kind in ("do", "live"):
+            self.live = self.live if kind == "live" else None  # a control's last value ends its drag
             self._form.take(message["id"], message.get("value"), live=kind == "live")
         elif kind == "pointer":
             self.panels[self.step].pointer(view, Pointer.of(message))
@@ -513,7 +516,7 @@ class Editor:
         session = self.require_session()
         if self.step == "Select":
             which = session.selection()
-            return None if which is None else session.scenes.gaussians(session.files.source_scene).select(which)
+            return None if which is None else session.scenes.scene("source").select(which)
         pairs = enumerate(session.objects())
         parts = [one.target_from_object.gaussians(session.placeable_object(i).gaussians) for i, one in pairs]
         return concatenate(parts) if parts else None

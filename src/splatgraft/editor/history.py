@@ -71,20 +71,16 @@ class StateStore:
 
     def name(self, state: EditState) -> str:
         """Return the name of a state, which need not be stored."""
-        name = _name(self._content(state))
-        self._remember(name, state)
-        return name
+        return self._named(state)[0]
 
     def save(self, state: EditState) -> str:
         """Write the state unless it is stored already; return its name."""
         with writable(self._states):
             self._states.mkdir(parents=True, exist_ok=True)
-        content = self._content(state)
-        name = _name(content)
+        name, content = self._named(state)
         if not self._file(name).is_file():
             with atomic_write(self._file(name)) as stream:
                 stream.write(content)
-        self._remember(name, state)
         return name
 
     def read(self, name: str) -> EditState:
@@ -116,8 +112,11 @@ class StateStore:
         with atomic_write(self._folder / _HISTORY_FILE) as stream:
             stream.write(json.dumps(asdict(history)).encode())
 
-    def _content(self, state: EditState) -> bytes:
-        return json.dumps(_to_json(state, self._project_folder), sort_keys=True).encode()
+    def _named(self, state: EditState) -> tuple[str, bytes]:
+        content = json.dumps(_to_json(state, self._project_folder), sort_keys=True).encode()
+        name = _name(content)
+        self._remember(name, state)
+        return name, content
 
     def _file(self, name: str) -> Path:
         return self._states / f"{name}.json"

@@ -140,10 +140,9 @@ class OpenPanel(Panel):
         self.editor.refresh()
 
     def _create(self) -> None:
-        captures = parse_path(self._paths["source"]), parse_path(self._paths["target"])
-        names = ("source_scene", "target_scene")
-        first, second = (parse_path(self._paths[name]) if self._paths[name] else None for name in names)
-        self.editor.project.create(captures, scenes=(first, second))
+        paths = {name: parse_path(text) for name, text in self._paths.items() if text}
+        scenes = paths.get("source_scene"), paths.get("target_scene")
+        self.editor.project.create((paths["source"], paths["target"]), scenes=scenes)
         self.editor.open_project()
         session = self.session
         if not any(map(session.files.has_photos, SIDES)):
@@ -189,12 +188,12 @@ class OpenPanel(Panel):
         form.choice(f"up_{side}", f"Up: {side}", views.up, ups, partial(set_view, "up"))
 
     def _line(self, session: Session, side: Side) -> str:
-        name, (scene, cameras) = _FIELDS[side], session.files.scene_and_cameras(side)
-        if not scene.is_file():
+        name, files = _FIELDS[side], session.files
+        if not files.scenes[side].is_file():
             return f"{name}: not built yet"
         text = f"{name}: ready"
-        if not session.files.has_photos(side) and cameras.is_file():
-            made = session.scenes.cameras(cameras)
+        if not files.has_photos(side) and files.cameras[side].is_file():
+            made = session.scenes.cameras(side)
             up = ", ".join(f"{round(x, 2) + 0.0:.2f}" for x in estimate_up(made).tolist())
             text += f", without photographs: {len(made)} pictures were rendered of it, with ({up}) as up"
         return text

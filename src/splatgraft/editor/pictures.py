@@ -27,7 +27,7 @@ from splatgraft.editor.light_process import Stage
 from splatgraft.editor.photo_view import PhotoView, prompt_of
 from splatgraft.editor.relit_preview import Draft
 from splatgraft.editor.scene_cache import SceneCache
-from splatgraft.editor.state import EditState
+from splatgraft.editor.state import EditState, stamp_of
 from splatgraft.project.gaussian_flags import read_flags
 from splatgraft.project.layout import IS_OBJECT_FILE
 from splatgraft.project.placement import ObjectPlacement
@@ -136,7 +136,7 @@ class LitScenes:
 
     def place(self, state: EditState) -> Gaussians:
         """Return the target without erased Gaussians."""
-        target, erased = self._scenes.gaussians(self._scenes.files.target_scene), state.erased
+        target, erased = self._scenes.scene("target"), state.erased
         if erased is None:
             return target
         if len(erased) != target.count:
@@ -285,15 +285,14 @@ class Pictures:
 
     def source_photo(self, index: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
         """Read a photo of the source, upright and at most 1920 pixels long, and its own width and height."""
-        path = self._scenes.photo(self._scenes.files.source_cameras, index)
-        stamp = path.stat().st_mtime_ns if path.is_file() else 0
-        return self._scenes.derive("photo", (str(path), stamp), lambda: read_upright(path, _LONGEST_PX))
+        path = self._scenes.photo(index)
+        return self._scenes.derive("photo", (str(path), *stamp_of(path)), lambda: read_upright(path, _LONGEST_PX))
 
     def draw_source(
         self, which: Bool[Tensor, "n"] | None, camera: Cameras, *, photo: int | None, alone: bool
     ) -> UInt8[np.ndarray, "h w 3"]:
         """Draw the source with the selection tinted, or the selection alone; `photo` replaces the rendered scene."""
-        scene = self._scenes.gaussians(self._scenes.files.source_scene)
+        scene = self._scenes.scene("source")
         if alone and which is not None:
             return draw(scene.select(which), camera)
         flags = None if which is None or not bool(which.any()) else which[:, None].to(scene.means)
@@ -306,7 +305,7 @@ class Pictures:
         out = view.drawn(pixels)
         if flags is None:
             return out
-        cameras = self._scenes.cameras(self._scenes.files.source_cameras)
+        cameras = self._scenes.cameras("source")
         width, height = view.drawn_size
         posed = cameras[photo].resized(width / cameras[photo].width)
         share = render(scene, posed, outputs=frozenset(), features=flags).features[0, ..., 0].numpy()
@@ -319,8 +318,8 @@ class Pictures:
 
         Raise ValueError if no object is found.
         """
-        cameras = self._scenes.cameras(self._scenes.files.source_cameras)
-        scene = self._scenes.gaussians(self._scenes.files.source_scene)
+        cameras = self._scenes.cameras("source")
+        scene = self._scenes.scene("source")
         small = cameras.resized(min(1.0, CUT_SIDE_PX / int(cameras.sizes.max())))
         prompts: dict[int, ViewPrompt] = {}
         for index, name in enumerate(cameras.names):

@@ -30,8 +30,7 @@ from splatgraft.editor.placement import (
     suggest_placement,
     with_base,
 )
-from splatgraft.editor.sky_dome import SkyDome
-from splatgraft.editor.state import check_height_cm, check_state
+from splatgraft.editor.state import check_height_cm
 from splatgraft.editor.stream import View
 from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
 from splatgraft.project.layout import Side
@@ -74,7 +73,7 @@ class PlacePanel(Panel):
     def build(self, form: Form) -> None:
         """Add the controls."""
         session = self.session
-        if not session.files.target_scene.is_file():
+        if not session.files.scenes["target"].is_file():
             form.note("The place is not there yet: see Open.")
             return
         objects = session.objects()
@@ -168,18 +167,18 @@ class PlacePanel(Panel):
 
     def _fit_size(self) -> None:
         (item, placed), session = self._one(), self.session
-        cameras = session.scenes.cameras(session.files.target_cameras)
+        cameras = session.scenes.cameras("target")
         self._place(rescale(item, placed, scale_in_view(item.base, self._base(), cameras=cameras)))
         self.editor.say("scaled to about a third of the views' height, which is a guess")
 
     def _find_place(self) -> None:
         session = self.session
         item = session.scenes.placeable_object(ObjectPlacement(Similarity.identity()))
-        cameras = session.scenes.cameras(session.files.target_cameras)
+        cameras = session.scenes.cameras("target")
         options = session.files.compose.options
         # as `compose` does
         options = replace(options, scale=session.true_scale()) if options.scale is None else options
-        placed = suggest_placement(session.scenes.gaussians(session.files.target_scene), item, cameras, options)
+        placed = suggest_placement(session.scenes.scene("target"), item, cameras, options)
         self._change(objects=(ObjectPlacement(placed.target_from_object),))
         doubts = " ".join(note.text for note in placed.warnings)
         self.editor.say(
@@ -209,7 +208,7 @@ class PlacePanel(Panel):
         path, session = Path.cwd() / Path(given).expanduser(), self.session
         read_gaussians(path)
         item = session.scenes.placeable_object(ObjectPlacement(Similarity.identity(), path))
-        placed = suggest_placement(self._merged(), item, session.scenes.cameras(session.files.target_cameras))
+        placed = suggest_placement(self._merged(), item, session.scenes.cameras("target"))
         self._append(ObjectPlacement(placed.target_from_object, path))
 
     def _merged(self) -> Gaussians:
@@ -257,9 +256,11 @@ class PlacePanel(Panel):
     def _nudge(self, view: View, right: int, away: int) -> None:
         """Move the chosen object by small steps to the right in the view and away from the viewer."""
         item, placed = self._one()
-        dome = SkyDome.seen_along(self.camera(view).world_from_camera[0, :3, 2], self.session.up())
+        up, across = self.session.up(), self.camera(view).world_from_camera[0, :3, 0]
+        across = torch.nn.functional.normalize(across - (across @ up) * up, dim=0)
         step = _NUDGE * placed.scale * max(item.base.height, item.base.radius)
-        self._place(replace(placed, translation=placed.translation + step * (right * dome.right + away * dome.forward)))
+        shift = step * (right * across + away * torch.linalg.cross(up, across))
+        self._place(replace(placed, translation=placed.translation + shift))
 
     # the pointer
 
@@ -311,7 +312,6 @@ class PlacePanel(Panel):
             placed = with_base(held.item, replace(placed, rotation=rotation_of((x, y, z))), at=foot)
         item = replace(session.objects()[index], target_from_object=placed)
         edited = session.placed_state().with_object(index, item)
-        check_state(edited)
         if pointer.what == "up":
             self._drag = None
             # the shown state itself, so that its light stays valid
@@ -325,14 +325,17 @@ class PlacePanel(Panel):
 
     def _toggle_box(self, value: bool) -> None:
         session, half = self.session, 0.25 * self.editor.scene_scale()
-        target = session.scenes.gaussians(session.files.target_scene)
+        target = session.scenes.scene("target")
         centre = self._base() if session.objects() else target.means.median(0).values
         self._box = Box(centre - half, centre + half) if value else None
 
     def _erase(self) -> None:
         session, box = self.session, self._box
         assert box is not None
-        inside, before = box.contains(session.scenes.gaussians(session.files.target_scene).means), session.state.erased
+        inside, before = (
+            box.contains(session.scenes.scene("target").means),
+            session.state.erased,
+        )
         self._change(erased=inside if before is None else before | inside)
         self.editor.say("erased what is in the box" if bool(inside.any()) else "nothing is in the box")
 

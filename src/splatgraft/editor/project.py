@@ -36,14 +36,10 @@ class ProjectFiles:
     """project.toml; placement.json, light.json, erased.npy and corrections.npy lie beside it."""
     root: Path
     """Folder of all results and exports."""
-    source_scene: Path
-    """The reconstruction with the object."""
-    target_scene: Path
-    """The reconstruction into which it is placed."""
-    source_cameras: Path
-    """transforms.json of the posed source."""
-    target_cameras: Path
-    """transforms.json of the posed target, which lies beside its photographs."""
+    scenes: Mapping[Side, Path]
+    """The reconstructions: with the object, and into which it is placed."""
+    cameras: Mapping[Side, Path]
+    """transforms.json of the posed captures, which lies beside the photographs."""
     object: Path
     """The object's Gaussians."""
     surroundings: Path
@@ -65,12 +61,6 @@ class ProjectFiles:
     relight: Relight
     """The step of the light transfer."""
 
-    def scene_and_cameras(self, side: Side) -> tuple[Path, Path]:
-        """Return the reconstruction of a side and its transforms.json."""
-        return (
-            (self.source_scene, self.source_cameras) if side == "source" else (self.target_scene, self.target_cameras)
-        )
-
     def has_photos(self, side: Side) -> bool:
         """Return whether a side has photographs; otherwise its images are rendered from a trained scene."""
         return not is_scene(self.captures[side].capture)
@@ -78,7 +68,7 @@ class ProjectFiles:
     @property
     def have_both_scenes(self) -> bool:
         """Whether both reconstructions exist."""
-        return self.source_scene.is_file() and self.target_scene.is_file()
+        return all(scene.is_file() for scene in self.scenes.values())
 
     @property
     def transfers_light(self) -> bool:
@@ -114,10 +104,8 @@ class Project:
         return ProjectFiles(
             file=self.file,
             root=layout.root,
-            source_scene=segment.scene,
-            target_scene=compose.target,
-            source_cameras=layout.capture("source") / CAMERAS_FILE,
-            target_cameras=layout.capture("target") / CAMERAS_FILE,
+            scenes={"source": segment.scene, "target": compose.target},
+            cameras={side: layout.capture(side) / CAMERAS_FILE for side in SIDES},
             object=compose.object,
             surroundings=layout.object / SURROUNDINGS_FILE,
             selection=layout.object / SELECTION_FILE,

@@ -16,7 +16,6 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from splatgraft.compositing.composite import Composite
-from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState
@@ -121,7 +120,7 @@ class RelitPreview:
         This takes less time than `relit`. Return None if nothing was moved or these layers exist already.
         """
         options, composite = self._scenes.files.relight.options, self._scenes.composite(state)
-        is_moved = self._full_values.is_moved(composite, self._cameras(), state.light, options)
+        is_moved = self._full_values.is_moved(composite, self._scenes.cameras("target"), state.light, options)
         if not is_moved or self._memo.peek("refined", self._inputs(state)) is not None:
             return None
         return self._make_once("refined", state, lambda: self._transfer(state, exact=False), lock=self._full_lock)
@@ -157,7 +156,7 @@ class RelitPreview:
     def _transfer(self, state: EditState, *, exact: bool) -> Relit:
         return self._full_values.relight(
             self._scenes.composite(state),
-            self._cameras(),
+            self._scenes.cameras("target"),
             sources=self._scenes.source_scenes(state),
             light=state.light,
             options=self._scenes.files.relight.options,
@@ -194,11 +193,10 @@ class RelitPreview:
                 erased=memo.get("none erased", (coarse,), lambda: torch.zeros(coarse.count, dtype=torch.bool)),
             )
         options = replace(self._scenes.files.relight.options, most_added=0.0, fitted_views=0)
-        relit = values.relight(drawn, self._cameras(), sources=sources, light=state.light, options=options, exact=False)
+        relit = values.relight(
+            drawn, self._scenes.cameras("target"), sources=sources, light=state.light, options=options, exact=False
+        )
         return coarse_draft(relit, parts) if parts else Draft(relit, torch.arange(relit.gaussians.count))
-
-    def _cameras(self) -> Cameras:
-        return self._scenes.cameras(self._scenes.files.target_cameras)
 
 
 def _is_large(composite: Composite) -> bool:

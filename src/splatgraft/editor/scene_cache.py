@@ -20,10 +20,11 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.posed_images import PosedImages
 from splatgraft.editor.placement import PlaceableObject
 from splatgraft.editor.project import ProjectFiles
-from splatgraft.editor.state import EditState
+from splatgraft.editor.state import EditState, stamp_of
 from splatgraft.folders.clock_sun import clock_sun_path, read_clock_sun
 from splatgraft.formats import read_cameras, read_capture, read_gaussians
 from splatgraft.project.gaussian_flags import read_flags
+from splatgraft.project.layout import Side
 from splatgraft.project.placement import ObjectPlacement, read_placement
 from splatgraft.relighting import SourceScene
 from splatgraft.runtime.memo import Memo
@@ -41,30 +42,35 @@ class SceneCache:
         """Read the scene in a file."""
         return self._read("gaussians", path, read_gaussians)
 
-    def cameras(self, path: Path) -> Cameras:
-        """Read the cameras in a file."""
-        return self._read("cameras", path, read_cameras)
+    def scene(self, side: Side) -> Gaussians:
+        """Read the reconstruction of a side."""
+        return self.gaussians(self.files.scenes[side])
 
-    def capture(self, path: Path) -> PosedImages:
-        """Read the posed images whose cameras are in a file."""
-        return self._read("capture", path, lambda path: read_capture(path.parent))
+    def cameras(self, side: Side) -> Cameras:
+        """Read the cameras of a side."""
+        return self._read("cameras", self.files.cameras[side], read_cameras)
 
-    def photo(self, path: Path, index: int) -> Path:
-        """Return the path of a camera's photo, even if `capture` fails because too many masks are missing."""
+    def capture(self) -> PosedImages:
+        """Read the posed images of the source."""
+        return self._read("capture", self.files.cameras["source"], lambda path: read_capture(path.parent))
+
+    def photo(self, index: int) -> Path:
+        """Return the path of a photo of the source, even if `capture` fails because too many masks are missing."""
+        path = self.files.cameras["source"]
         return self._read("photos", path, lambda path: _named(path, "file_path"))[index] or path
 
-    def missing_masks(self, path: Path) -> list[Path]:
-        """List the masks that a transforms.json names but that do not exist."""
-        masks = self._read("masks", path, lambda path: _named(path, "mask_path"))
+    def missing_masks(self) -> list[Path]:
+        """List the masks that the source's transforms.json names but that do not exist."""
+        masks = self._read("masks", self.files.cameras["source"], lambda path: _named(path, "mask_path"))
         return [mask for mask in masks if mask is not None and not mask.is_file()]
 
     def segmented(self) -> Bool[Tensor, "n"] | None:
         """Return the flags of the source's Gaussians by the last `segment`; None without a valid result."""
-        if not self.files.selection.is_file() or not self.files.source_scene.is_file():
+        if not self.files.selection.is_file() or not self.files.scenes["source"].is_file():
             return None
         found = self._read("selection", self.files.selection, read_flags)
         # flags of another reconstruction do not apply
-        return found if len(found) == self.gaussians(self.files.source_scene).count else None
+        return found if len(found) == self.scene("source").count else None
 
     def composed_objects(self) -> tuple[ObjectPlacement, ...]:
         """Read the objects as `compose` placed them; the project's own object gets no path."""
@@ -84,7 +90,7 @@ class SceneCache:
         """Return a placed object with its base."""
         path = self.object_path(item)
         gaussians, own = self.gaussians(path), path == self.files.object
-        cameras = self.cameras(self.files.source_cameras if own else self.files.target_cameras)
+        cameras = self.cameras("source" if own else "target")
         surroundings = self.gaussians(self.files.surroundings) if own and self.files.surroundings.is_file() else None
 
         def make() -> PlaceableObject:
@@ -95,7 +101,7 @@ class SceneCache:
 
     def composite(self, state: EditState) -> Composite:
         """Compose the target with the placed objects; the same edits give the same object."""
-        target = self.gaussians(self.files.target_scene)
+        target = self.scene("target")
 
         def make() -> Composite:
             items, erased = state.objects or (), state.erased
@@ -112,17 +118,17 @@ class SceneCache:
         own = [self.object_path(item) == self.files.object for item in state.objects or ()]
         if not any(own) or not self.files.surroundings.is_file():
             return [None] * len(own)
-        inputs = (self.gaussians(self.files.surroundings), self.cameras(self.files.source_cameras))
-        clock = self._clock(self.files.source_cameras)
+        inputs = (self.gaussians(self.files.surroundings), self.cameras("source"))
+        clock = self._clock("source")
         source = self.derive("source", (*inputs, clock), lambda: SourceScene(*inputs, clock=clock))
         return [source if flag else None for flag in own]
 
     def target_clock(self) -> ClockSun | None:
         """Read the sun by the clock of the target's photos."""
-        return self._clock(self.files.target_cameras)
+        return self._clock("target")
 
-    def _clock(self, cameras: Path) -> ClockSun | None:
-        return self._read("clock", clock_sun_path(cameras), read_clock_sun)
+    def _clock(self, side: Side) -> ClockSun | None:
+        return self._read("clock", clock_sun_path(self.files.cameras[side]), read_clock_sun)
 
     def derive(self, name: str, inputs: tuple[Any, ...], make: Callable[[], Any]) -> Any:
         """Return the memoised result of `make`, computed again when one of `inputs` is another object."""
@@ -131,12 +137,7 @@ class SceneCache:
             return self._memo.get(name, inputs, make)
 
     def _read(self, kind: str, path: Path, read: Callable[[Path], Any]) -> Any:
-        return self.derive(f"{kind} {path}", _stamp(path), lambda: read(path))
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    """Return time and size of a file; zeros if it does not exist."""
-    return (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)
+        return self.derive(f"{kind} {path}", stamp_of(path), lambda: read(path))
 
 
 def _named(transforms: Path, key: str) -> list[Path | None]:

@@ -10,7 +10,6 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.form import Form
 from splatgraft.editor.panel import CORNERS, Panel, Pointer, box_over
 from splatgraft.editor.photo_view import PhotoView, prompt_of, seen_best, with_click
@@ -65,12 +64,12 @@ class SelectPanel(Panel):
     def build(self, form: Form) -> None:
         """Add the controls."""
         editor, session = self.editor, self.session
-        if not session.files.source_scene.is_file():
+        if not session.files.scenes["source"].is_file():
             form.note("The scene with the object is not there yet: see Open.")
             return
         state, selection = session.state, session.selection()
         form.note(self._said(bool(selection is not None and selection.any())), name="selection")
-        masks = [path.name for path in session.scenes.missing_masks(session.files.source_cameras)]
+        masks = [path.name for path in session.scenes.missing_masks()]
         more = f" and {len(masks) - 3} more" if len(masks) > 3 else ""
         form.note(f"Missing masks: {', '.join(masks[:3])}{more}." if masks else "", name="warning", bad=True)
         marks, hint = {"the object": True, "what is beside it": False}, "Alt or the right button: what is beside it"
@@ -124,7 +123,7 @@ class SelectPanel(Panel):
         if view.photo is None:
             box = session.box()
             return {"dots": [], "lines": []} if box is None else box_over(box, camera, _ORANGE)
-        name = session.scenes.cameras(session.files.source_cameras).names[view.photo]
+        name = session.scenes.cameras("source").names[view.photo]
         prompt, (width, height) = prompt_of(session.state.prompts, name), session.pictures.source_photo(view.photo)[1]
         shown, dots = PhotoView((width, height), (camera.width, camera.height)), []
         for points, color in ((prompt.inside, _GREEN), (prompt.outside, _RED)):
@@ -157,7 +156,7 @@ class SelectPanel(Panel):
             camera = self.camera(view)
             (x, y), (u, v) = pointer.place, pointer.to
             lower, upper = (min(x, u), min(y, v)), (max(x, u), max(y, v))
-            inside = in_rectangle(self._scene().means, camera, lower=lower, upper=upper)
+            inside = in_rectangle(self.session.scenes.scene("source").means, camera, lower=lower, upper=upper)
             self._correct(inside, add=self._adds != pointer.alt)
         elif pointer.on in CORNERS:
             found = self.dragged_box(view, pointer, self.session.box())
@@ -171,14 +170,14 @@ class SelectPanel(Panel):
     def _mark(self, view: View, pointer: Pointer) -> None:
         """Add a point to the photo in view, or to the one with the most similar direction, and show it."""
         session, pictures = self.session, self.session.pictures
-        cameras, photo = session.scenes.cameras(session.files.source_cameras), view.photo
+        cameras, photo = session.scenes.cameras("source"), view.photo
         if photo is not None:
             size = pictures.source_photo(photo)[1]
             pixel = PhotoView(size, view.canvas).pixel_at(pointer.place)
             if pixel is None:
                 raise ValueError("Click in the photo, not beside it.")
         else:
-            hit, ray = self.surface_under(pointer, view, self._scene())
+            hit, ray = self.surface_under(pointer, view, self.session.scenes.scene("source"))
             photo, pixel = seen_best(hit, ray.direction, cameras)
             size = pictures.source_photo(photo)[1]
             scale = size[0] / cameras[photo].width
@@ -206,9 +205,9 @@ class SelectPanel(Panel):
         self.editor.say(on if value else "the brush is off")
 
     def _paint(self, view: View, pointer: Pointer) -> None:
-        ray = Ray.through(pointer.place, self.camera(view))
+        ray, scene = Ray.through(pointer.place, self.camera(view)), self.session.scenes.scene("source")
         if pointer.what in ("down", "click"):
-            self._stroke, self._touched = [ray], torch.zeros(self._scene().count, dtype=torch.bool)
+            self._stroke, self._touched = [ray], torch.zeros(scene.count, dtype=torch.bool)
             new = [ray]
         elif self._touched is None:
             return
@@ -219,7 +218,7 @@ class SelectPanel(Panel):
             self._touched = None
             return
         assert self._touched is not None
-        self._touched = self._touched | brush_selection(self._scene(), new, size=self._brush_size)
+        self._touched = self._touched | brush_selection(scene, new, size=self._brush_size)
         self.editor.stream.touch(moving=True)
         if pointer.what in ("up", "click"):
             touched, self._touched = self._touched, None
@@ -256,9 +255,9 @@ class SelectPanel(Panel):
         """Return the box around the cameras' focus, or the middle half of the scene if there is no capture."""
         session = self.session
         try:
-            return default_box(session.scenes.capture(session.files.source_cameras))
+            return default_box(session.scenes.capture())
         except ValueError:
-            lower, upper = self._scene().means.quantile(torch.tensor([0.25, 0.75]), 0)
+            lower, upper = self.session.scenes.scene("source").means.quantile(torch.tensor([0.25, 0.75]), 0)
             return Box(lower, torch.maximum(upper, lower + 1e-6))
 
     def _set_box(self, box: Box) -> None:
@@ -267,7 +266,3 @@ class SelectPanel(Panel):
     def _set(self, **fields: object) -> None:
         session = self.session
         session.change(replace(session.state, **fields))  # pyright: ignore[reportArgumentType]
-
-    def _scene(self) -> Gaussians:
-        session = self.session
-        return session.scenes.gaussians(session.files.source_scene)

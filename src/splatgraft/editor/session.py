@@ -147,9 +147,9 @@ class Session:
 
     def selection(self) -> Bool[Tensor, "n"] | None:
         """Flag the source's Gaussians of the object: segmented, or else in the box, with corrections."""
-        if not self.files.source_scene.is_file():
+        if not self.files.scenes["source"].is_file():
             return None
-        scene = self.scenes.gaussians(self.files.source_scene)
+        scene = self.scenes.scene("source")
         segmented, state = self.scenes.segmented(), self.state
         inputs = (scene, segmented, state.box, state.corrections)
         return self.scenes.derive("selected", inputs, lambda: self._selected(scene, segmented))
@@ -182,7 +182,7 @@ class Session:
         if self.state.objects is not None:
             return self.state.objects
         files = self.files
-        is_composed = all(path.is_file() for path in (files.object, files.target_scene, files.placement))
+        is_composed = all(path.is_file() for path in (files.object, files.scenes["target"], files.placement))
         return self.scenes.composed_objects() if is_composed else ()
 
     def placed_state(self) -> EditState:
@@ -195,7 +195,7 @@ class Session:
 
     def up(self, side: Side = "target") -> Float[Tensor, "3"]:
         """Return the up direction of the target, or of the source."""
-        cameras = self.scenes.cameras(self.files.scene_and_cameras(side)[1])
+        cameras = self.scenes.cameras(side)
         return self.scenes.derive(f"up {side}", (cameras,), lambda: estimate_up(cameras))
 
     def set_placement(self, index: int, target_from_object: Similarity) -> None:
@@ -209,16 +209,16 @@ class Session:
         """Return the size of one placed object; raise ValueError if a scale.json cannot be read."""
         item, height = self.objects()[index], self.placeable_object(index).base.height
         is_own = self.scenes.object_path(item) == self.files.object
-        own = read_scale(self.files.source_cameras) if is_own else None
+        own = read_scale(self.files.cameras["source"]) if is_own else None
         true_cm, cm_per_scale = (
             None if known is None else 100 * known.metres_per_unit * height
-            for known in (own, read_scale(self.files.target_cameras))
+            for known in (own, read_scale(self.files.cameras["target"]))
         )
         return ObjectSize(item.target_from_object.scale, true_cm, cm_per_scale)
 
     def true_scale(self) -> float | None:
         """Return the scale that keeps the true size of the source's object; None if a capture's scale is unknown."""
-        own, place = read_scale(self.files.source_cameras), read_scale(self.files.target_cameras)
+        own, place = read_scale(self.files.cameras["source"]), read_scale(self.files.cameras["target"])
         return None if own is None or place is None else own.metres_per_unit / place.metres_per_unit
 
     def set_scale(self, index: int, cm: float, side: Side) -> Path:
@@ -233,7 +233,7 @@ class Session:
                 f"{path}: expected the object of the project's source, found one that was added from a file"
             )
         found = MetricScale(0.01 * cm / height, f"{by} height of {cm:g} cm")
-        return write_scale(self.files.scene_and_cameras(side)[1], found)
+        return write_scale(self.files.cameras[side], found)
 
     # stale steps
 

@@ -27,8 +27,7 @@ from splatgraft.steps.segment import Segment
 from splatgraft.workflow.flow import read_flow
 
 BoxNumbers = tuple[float, float, float, float, float, float]
-Stamps = tuple[tuple[int, int] | None, ...]
-"""Time and size of each file of the edits; None for a missing file."""
+Stamp = tuple[int, int]
 
 _SCALES = (1e-6, 1e6)
 """Range of an object's scale; beyond it covariances leave the range of float32."""
@@ -177,9 +176,14 @@ def state_files(project: Path) -> tuple[Path, ...]:
     return (project, *(project.parent / name for name in names))
 
 
-def stamps_of(project: Path) -> Stamps:
+def stamps_of(project: Path) -> tuple[Stamp, ...]:
     """Return the current stamps of these files."""
-    return tuple((p.stat().st_mtime_ns, p.stat().st_size) if p.is_file() else None for p in state_files(project))
+    return tuple(map(stamp_of, state_files(project)))
+
+
+def stamp_of(path: Path) -> Stamp:
+    """Return time and size of a file; zeros if it does not exist."""
+    return (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)
 
 
 def _keys(state: EditState) -> dict[tuple[str, str], Any]:
