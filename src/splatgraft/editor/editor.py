@@ -94,7 +94,9 @@ class Editor:
         self._moves: dict[str, Any] | None = None
         """Newest waiting move of the pointer; it replaces earlier ones."""
         self.stream = Stream(self, self._drawing_failed)
-        self._marker = LatestOnlyWorker(self._find_marks, self._failed)
+        self._marker = LatestOnlyWorker(self._failed)
+        self.background = LatestOnlyWorker(self._failed)
+        """Worker for what the panels show as soon as it is computed."""
         self.panels: dict[str, Panel] = {
             "Open": OpenPanel(self),
             "Select": SelectPanel(self),
@@ -113,7 +115,7 @@ class Editor:
         """End all threads and the light process; jobs continue."""
         self._is_open = False
         self._actions.put(None)
-        for closed in (self.stream, self._marker, self._light, *self.panels.values()):
+        for closed in (self.stream, self._marker, self.background, self._light):
             if closed is not None:
                 closed.close()
 
@@ -188,7 +190,7 @@ class Editor:
             self._want_light()
             self._send_panel()
             self.stream.touch()
-            self._marker.submit(self.session)
+            self._marker.submit(partial(self._find_marks, self.session))
 
     def _add_view(self, form: Form) -> None:
         """Add the controls of the picture, common to all steps of the target."""
@@ -475,20 +477,17 @@ class Editor:
             self._press(view, message["key"])
 
     def _press(self, view: View, key: str) -> None:
-        common: dict[str, Callable[[], object]] = {
-            "ctrl+z": lambda: self._undo(self.require_session().step(-1), "undone", "nothing to undo"),
-            "ctrl+shift+z": lambda: self._undo(self.require_session().step(1), "redone", "nothing to redo"),
-            "f": lambda: self._look_at_object(view),
-            "home": lambda: self.to_photo(0),
-        }
-        if key in common:
-            common[key]()
+        steps = {"ctrl+z": (-1, "undone"), "ctrl+shift+z": (1, "redone")}
+        if key in steps:
+            by, word = steps[key]
+            self.live = None
+            self.say(word if self.require_session().step(by) else f"nothing can be {word}")
+        elif key == "f":
+            self._look_at_object(view)
+        elif key == "home":
+            self.to_photo(0)
         elif not self.panels[self.step].key(view, key) and key in ("arrowleft", "arrowright"):
             self.to_photo((view.photo or 0) + (1 if key == "arrowright" else -1))
-
-    def _undo(self, is_done: bool, done: str, nothing: str) -> None:
-        self.live = None
-        self.say(done if is_done else nothing)
 
     def show_step(self, step: str) -> None:
         """Switch to another step."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,9 +22,6 @@ from splatgraft.editor.stream import View
 from splatgraft.relighting import Light, LightSource
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.sun import Point, direction_through, set_sun, with_sun
-
-if TYPE_CHECKING:
-    from splatgraft.editor.editor import Editor
 
 _FIRST = (
     ("exposure", "Brightness", (-2.0, 2.0), "Of the object, in stops; 0 is as computed"),
@@ -54,20 +51,17 @@ _LOWEST, _HIGH = 25.0, 55.0
 class LightPanel(Panel):
     """Controls of the light, and the lights in the view."""
 
-    def __init__(self, editor: "Editor") -> None:
-        """Start without clicks for the sun."""
-        super().__init__(editor)
-        self._chosen, self._sets_sun = 0, False
-        self._points: tuple[Point, ...] = ()
-        self._set_light: Light | None = None
-        """Light when the last point was added; if it was replaced, for example by undo, pairs begin anew."""
-        self._full: tuple[tuple[float, float, float], ...] = ()
-        """Irradiance of each source at a strength of 1, before the slider changed it."""
-        self._scaled: tuple[LightSource, ...] | None = None
-        """Sources after the last change by the slider."""
-        self._dome: SkyDome | None = None
-        """Orientation of the picture of the sky."""
-        self._handle: tuple[int, Corner] | None = None
+    _chosen, _sets_sun = 0, False
+    _points: tuple[Point, ...] = ()
+    _set_light: Light | None = None
+    """Light when the last point was added; if it was replaced, for example by undo, pairs begin anew."""
+    _full: tuple[tuple[float, float, float], ...] = ()
+    """Irradiance of each source at a strength of 1, before the slider changed it."""
+    _scaled: tuple[LightSource, ...] | None = None
+    """Sources after the last change by the slider."""
+    _dome: "SkyDome | None" = None
+    """Orientation of the picture of the sky."""
+    _handle: tuple[int, Corner] | None = None
 
     def leave(self) -> None:
         """End drags and clicks for the sun."""

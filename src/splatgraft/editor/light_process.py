@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal, get_args
 
@@ -133,8 +134,8 @@ class _Computing:
         self._lock = threading.Lock()
         self._scenes = SceneCache(project.files())
         self._relighting = RelitPreview(self._scenes)
-        self._drafts = LatestOnlyWorker(self._draft, self._failed)
-        self._lights = LatestOnlyWorker(self._light, self._failed)
+        self._drafts = LatestOnlyWorker(self._failed)
+        self._lights = LatestOnlyWorker(self._failed)
         self._number, self._state = 0, EditState()
 
     def take(self, number: int, changed: dict[str, Any], wanted: Wanted) -> None:
@@ -142,10 +143,9 @@ class _Computing:
         if stamps != self._stamps:
             self._scenes.files, self._stamps = self._project.files(), stamps
         self._number, self._state = number, replace(self._state, **changed)
-        self._drafts.submit((number, self._state, wanted))
+        self._drafts.submit(partial(self._draft, number, self._state, wanted))
 
-    def _draft(self, asked: tuple[int, EditState, Wanted]) -> None:
-        number, state, wanted = asked
+    def _draft(self, number: int, state: EditState, wanted: Wanted) -> None:
         if wanted == "prepared":
             if self._drafts.wait_idle(_SETTLE_SECONDS):
                 self._relighting.prepare_drafts(state)
@@ -156,10 +156,9 @@ class _Computing:
             sent = replace(_without_evidence(draft.relit), gaussians=none, objects=())
             self._send(number, "draft", replace(draft, relit=sent))
         if wanted == "final":
-            self._lights.submit(asked)
+            self._lights.submit(partial(self._light, number, state))
 
-    def _light(self, asked: tuple[int, EditState, Wanted]) -> None:
-        number, state, _ = asked
+    def _light(self, number: int, state: EditState) -> None:
         if not self._lights.wait_idle(_SETTLE_SECONDS) or number != self._number:
             return
         refined = self._relighting.refined(state)

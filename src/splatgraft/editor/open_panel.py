@@ -9,7 +9,6 @@ from splatgraft.editor.form import Form
 from splatgraft.editor.panel import Panel
 from splatgraft.editor.placement import Triple
 from splatgraft.editor.session import Session
-from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.folders.input_description import InputDescription, describe_input
 from splatgraft.formats import SCENE_SUFFIXES
 from splatgraft.project.layout import SIDES, Side
@@ -53,11 +52,6 @@ class OpenPanel(Panel):
         self._found: dict[str, InputDescription | None] = dict.fromkeys(SIDES)
         self._browsed: tuple[str, Path] | None = None
         """Field for which a folder of this machine is shown, and that folder."""
-        self._looker = LatestOnlyWorker(self._look, lambda error: editor.say(str(error), bad=True))
-
-    def close(self) -> None:
-        """End the thread."""
-        self._looker.close()
 
     def build(self, form: Form) -> None:
         """Add the controls of a new project, or those of the open one."""
@@ -131,7 +125,7 @@ class OpenPanel(Panel):
         self._paths[name] = value.strip()
         if name in SIDES:
             self._found[name] = None
-            self._looker.submit(dict(self._paths))
+            self.editor.background.submit(partial(self._look, dict(self._paths)))
 
     def _look(self, paths: dict[str, str]) -> None:
         """Describe the inputs at the paths."""

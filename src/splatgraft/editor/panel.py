@@ -68,10 +68,11 @@ class Pointer:
 class Panel:
     """One step of the workflow."""
 
+    _held_box: tuple[Box, Corner] | None = None
+
     def __init__(self, editor: Editor) -> None:
         """Attach to an editor."""
         self.editor = editor
-        self._held_box: tuple[Box, Corner] | None = None
 
     @property
     def session(self) -> Session:
@@ -120,9 +121,6 @@ class Panel:
         if hit is None:
             raise ValueError("Click on a surface: there is none under the pointer.")
         return hit, ray
-
-    def close(self) -> None:
-        """End all threads."""
 
     def build(self, form: Form) -> None:
         """Add the controls for the current state."""

@@ -30,7 +30,7 @@ from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState, stamp_of
 from splatgraft.project.gaussian_flags import read_flags
 from splatgraft.project.layout import IS_OBJECT_FILE
-from splatgraft.project.placement import ObjectPlacement
+from splatgraft.project.placement import ObjectPlacement, object_to_json
 from splatgraft.relighting import LayerWeights, Relit
 from splatgraft.relighting.shading import apply_gain
 from splatgraft.rendering import RenderOptions, render, view_operator
@@ -69,16 +69,9 @@ class _LitState:
 
 
 def same_places(a: Sequence[ObjectPlacement] | None, b: Sequence[ObjectPlacement] | None) -> bool:
-    """Return whether objects and placements are the same."""
-    if a is b:
-        return True
-    return len(a or ()) == len(b or ()) and all(
-        x.object_path == y.object_path
-        and x.target_from_object.scale == y.target_from_object.scale
-        and torch.equal(x.target_from_object.rotation, y.target_from_object.rotation)
-        and torch.equal(x.target_from_object.translation, y.target_from_object.translation)
-        for x, y in zip(a or (), b or (), strict=True)
-    )
+    """Return whether objects and placements are the same, by the numbers that are written."""
+    first, second = ([object_to_json(item, Path()) for item in items or ()] for items in (a, b))
+    return first == second
 
 
 class LitScenes:
@@ -302,16 +295,12 @@ class Pictures:
             return pixels if flags is None else _tinted(pixels, found.features[0, ..., 0].numpy())
         pixels, size = self.source_photo(photo)
         view = PhotoView(size, (camera.width, camera.height))
-        out = view.drawn(pixels)
-        if flags is None:
-            return out
-        cameras = self._scenes.cameras("source")
-        width, height = view.drawn_size
-        posed = cameras[photo].resized(width / cameras[photo].width)
-        share = render(scene, posed, outputs=frozenset(), features=flags).features[0, ..., 0].numpy()
-        (left, top), whole = (round(x) for x in view.corner), np.zeros(out.shape[:2], np.float32)
-        whole[top : top + height, left : left + width] = cv2.resize(share, (width, height))
-        return _tinted(out, whole)
+        if flags is not None:
+            own, drawn = self._scenes.cameras("source")[photo], view.drawn_size
+            found = render(scene, own.resized(drawn[0] / own.width), outputs=frozenset(), features=flags)
+            share = cv2.resize(found.features[0, ..., 0].numpy(), drawn)
+            pixels = _tinted(cv2.resize(pixels, drawn, interpolation=cv2.INTER_AREA), share)
+        return view.drawn(pixels)
 
     def outline(self, state: EditState, photo: int) -> list[list[tuple[float, float]]]:
         """Outline the object in one photo by the clicks, as the first round of `segment` does, over the photo's sides.

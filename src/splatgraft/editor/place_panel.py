@@ -1,11 +1,10 @@
 """The step `Place`: place objects by the pointer, numbers and operations; erase parts of the target."""
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import torch
 from jaxtyping import Float
@@ -17,6 +16,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.similarity import Similarity
 from splatgraft.editor.drag import Drag, DragMode, outline
 from splatgraft.editor.form import Form
+from splatgraft.editor.open_panel import parse_path
 from splatgraft.editor.panel import CORNERS, Panel, Pointer, box_over
 from splatgraft.editor.pictures import same_places
 from splatgraft.editor.placement import (
@@ -37,9 +37,6 @@ from splatgraft.project.layout import Side
 from splatgraft.project.placement import ObjectPlacement
 from splatgraft.segmentation import Box
 
-if TYPE_CHECKING:
-    from splatgraft.editor.editor import Editor
-
 _NUDGE = 0.05  # step of an arrow key over the object's height
 _SNAP_DEGREES = 15.0
 _SAME = 0.002  # relative difference below which two sizes count as equal
@@ -51,12 +48,9 @@ _RED = "#f04646"
 class PlacePanel(Panel):
     """Controls of the objects, and the target with its objects in the view."""
 
-    def __init__(self, editor: "Editor") -> None:
-        """Start without a drag or box."""
-        super().__init__(editor)
-        self._chosen, self._snaps, self._path, self._known_cm = 0, False, "", 0.0
-        self._drag: tuple[int, DragMode, tuple[float, float], Drag] | None = None
-        self._box: Box | None = None
+    _chosen, _snaps, _known_cm = 0, False, 0.0
+    _drag: tuple[int, DragMode, tuple[float, float], Drag] | None = None
+    _box: Box | None = None
 
     def leave(self) -> None:
         """End drags and remove the box."""
@@ -88,8 +82,7 @@ class PlacePanel(Panel):
         if objects:
             self._build_numbers(form)
         hint = "A trained scene (.ply, .spz, .sog, ...)"
-        form.text("file", "File of another object", self._path, self._set_path, hint=hint)
-        form.button("add", "Add this file", lambda: self._add_file(self._path), disabled=not self._path)
+        form.text("file", "File of another object", "", self._add_file, hint=hint)
         form.upload("upload_object", "Upload a file", SCENE_SUFFIXES)
         is_boxed = self._box is not None
         form.check("erase_box", "Box to erase in", is_boxed, self._toggle_box, hint="What is in it is taken out")
@@ -196,16 +189,13 @@ class PlacePanel(Panel):
         objects = self.session.objects()
         self._change(objects=(*objects[: self._chosen], *objects[self._chosen + 1 :]))
 
-    def _set_path(self, value: str) -> None:
-        self._path = value.strip()
-
     def uploaded(self, path: Path, use: str) -> None:
         """Add an uploaded object."""
         if use == "upload_object":
             self._add_file(str(path))
 
     def _add_file(self, given: str) -> None:
-        path, session = Path.cwd() / Path(given).expanduser(), self.session
+        path, session = parse_path(given), self.session
         read_gaussians(path)
         item = session.scenes.placeable_object(ObjectPlacement(Similarity.identity(), path))
         placed = suggest_placement(self._merged(), item, session.scenes.cameras("target"))
@@ -343,11 +333,7 @@ class PlacePanel(Panel):
 def _about(size: ObjectSize, *, is_given: bool) -> str:
     """Describe an object's known size and how to enter the rest; `is_given`: project.toml sets the scale."""
     if size.cm_per_scale is None and is_given:
-        return (
-            "Same size as in its photos."
-            if math.isclose(size.scale, 1.0)
-            else f"{size.scale:.4g} times its size in its photos, as the project says."
-        )
+        return f"{size.scale:.4g} times its size in its photos, as the project says."
     if size.cm_per_scale is None:
         return "Its size here is a guess, as nobody has measured the place: under More, type the object's true height."
     if size.true_cm is None:

@@ -4,7 +4,6 @@ import shlex
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import numpy as np
@@ -21,9 +20,6 @@ from splatgraft.exports.export import Layer
 from splatgraft.harmonization import HARMONIZERS
 from splatgraft.project.layout import EXPORTS_FOLDER, REPORT_FILE
 from splatgraft.runtime.optional_dependencies import extra_providing
-
-if TYPE_CHECKING:
-    from splatgraft.editor.editor import Editor
 
 _LABEL = "Update result"
 _LISTED = 6  # number of listed shared files, newest first
@@ -62,10 +58,7 @@ PARTS: dict[str, Layer] = {
 class RunPanel(Panel):
     """Controls to compute the result of the edits."""
 
-    def __init__(self, editor: "Editor") -> None:
-        """Start without the report."""
-        super().__init__(editor)
-        self._with_report = False
+    _with_report = False
 
     def enter(self) -> None:
         """Show the result, if it exists."""
@@ -108,13 +101,10 @@ class RunPanel(Panel):
 class SharePanel(Panel):
     """Controls to write a file by a job and send it to the editing window."""
 
-    def __init__(self, editor: "Editor") -> None:
-        """Start with the first kind of file and the first part."""
-        super().__init__(editor)
-        self._kind = next(iter(SHARE_KINDS))
-        self._part: Layer = "all"
-        self._asked = 0
-        """Process id of the job that writes a file for the window."""
+    _kind = next(iter(SHARE_KINDS))
+    _part: Layer = "all"
+    _asked = 0
+    """Process id of the job that writes a file for the window."""
 
     def build(self, form: Form) -> None:
         """Add the kinds of files, the command, and the list of files."""

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -16,11 +16,7 @@ from splatgraft.editor.photo_view import PhotoView, prompt_of, seen_best, with_c
 from splatgraft.editor.picking import Ray, brush_selection, in_rectangle, interpolate_rays
 from splatgraft.editor.state import EditState
 from splatgraft.editor.stream import View
-from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.segmentation import Box, Keep, default_box
-
-if TYPE_CHECKING:
-    from splatgraft.editor.editor import Editor
 
 _SOURCES = {
     "masks beside the photos, else cut from them": "auto",
@@ -38,28 +34,17 @@ _GREEN, _RED, _ORANGE = "#3cdc5a", "#eb283c", "#ff9628"
 class SelectPanel(Panel):
     """Controls of the selection, and the source in the view."""
 
-    def __init__(self, editor: "Editor") -> None:
-        """Start without the brush."""
-        super().__init__(editor)
-        self._marks_object, self._uses_brush, self._adds, self._is_alone = True, False, False, False
-        self._brush_size = 0.1
-        self._stroke: list[Ray] = []
-        self._touched: Tensor | None = None
-        self._finder = LatestOnlyWorker(self._find_outline, lambda error: editor.say(str(error), bad=True))
-
-    def close(self) -> None:
-        """End the thread."""
-        self._finder.close()
-
-    def enter(self) -> None:
-        """Begin at the first photo."""
-        if self.editor.session is not None and self.editor.cameras() is not None:
-            self.editor.to_photo(0)
+    _marks_object, _uses_brush, _adds, _is_alone = True, False, False, False
+    _brush_size = 0.1
+    _last: Ray | None = None
+    """Last ray of a stroke."""
+    _touched: Tensor | None = None
+    """Gaussians that the stroke touches."""
 
     def leave(self) -> None:
         """Switch the brush off."""
         super().leave()
-        self._uses_brush, self._stroke, self._touched = False, [], None
+        self._uses_brush, self._last, self._touched = False, None, None
 
     def build(self, form: Form) -> None:
         """Add the controls."""
@@ -140,11 +125,10 @@ class SelectPanel(Panel):
         found = self.session.scenes.derive("outlines by photo", (state.prompts,), dict)
         if photo not in found:
             found[photo] = []
-            self._finder.submit((state, photo, found))
+            self.editor.background.submit(partial(self._find_outline, state, photo, found))
         return found[photo]
 
-    def _find_outline(self, asked: tuple[EditState, int, dict[int, Any]]) -> None:
-        state, photo, found = asked
+    def _find_outline(self, state: EditState, photo: int, found: dict[int, Any]) -> None:
         found[photo] = self.session.pictures.outline(state, photo)
         self.editor.stream.touch()
 
@@ -207,13 +191,13 @@ class SelectPanel(Panel):
     def _paint(self, view: View, pointer: Pointer) -> None:
         ray, scene = Ray.through(pointer.place, self.camera(view)), self.session.scenes.scene("source")
         if pointer.what in ("down", "click"):
-            self._stroke, self._touched = [ray], torch.zeros(scene.count, dtype=torch.bool)
+            self._touched = torch.zeros(scene.count, dtype=torch.bool)
             new = [ray]
-        elif self._touched is None:
+        elif self._touched is None or self._last is None:
             return
         else:
-            new = interpolate_rays(self._stroke[-1], ray, size=self._brush_size)
-            self._stroke = [ray]
+            new = interpolate_rays(self._last, ray, size=self._brush_size)
+        self._last = ray
         if pointer.what == "cancel":
             self._touched = None
             return

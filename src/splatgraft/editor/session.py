@@ -19,7 +19,6 @@ from splatgraft.editor.project import Project, ProjectFiles, in_words
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import (
     EditState,
-    as_written,
     check_height_cm,
     check_state,
     read_state,
@@ -29,6 +28,7 @@ from splatgraft.editor.state import (
 from splatgraft.project.layout import EDITOR_FOLDER, Side
 from splatgraft.project.metric_scale import MetricScale, read_scale, write_scale
 from splatgraft.project.placement import ObjectPlacement
+from splatgraft.relighting import light_from_json, light_to_json
 from splatgraft.runtime.files import is_disk_full
 from splatgraft.segmentation import Box, add_correction, apply_corrections
 
@@ -86,7 +86,9 @@ class Session:
         """
         check_state(state)
         with self._lock:
-            state = as_written(state, self.state)
+            if state.light is not None and state.light is not self.state.light:
+                # rounded as in light.json; a light that stays is the same object
+                state = replace(state, light=light_from_json(light_to_json(state.light)))
             name = self._store.save(state)
             if name != self.history.present:
                 self._apply(self.history.pushed(name), state)

@@ -19,7 +19,7 @@ from splatgraft.project.layout import ERASED_FILE, LIGHT_FILE, PLACEMENT_FILE
 from splatgraft.project.placement import ObjectPlacement, Placement, read_placement, write_placement
 from splatgraft.project.prompts import read_prompts, write_prompts
 from splatgraft.project.toml_edit import with_keys
-from splatgraft.relighting import LayerWeights, Light, light_from_json, light_to_json
+from splatgraft.relighting import LayerWeights, Light, light_to_json
 from splatgraft.runtime.files import atomic_write
 from splatgraft.runtime.settings import read_toml
 from splatgraft.steps.relight import Relight
@@ -161,13 +161,6 @@ def write_state(project: Path, before: EditState, after: EditState) -> None:
     if text != old:
         with atomic_write(project) as stream:
             stream.write(text.encode())
-
-
-def as_written(state: EditState, before: EditState) -> EditState:
-    """Round the light to six digits, as light.json does; a light shared with `before` stays identical."""
-    if state.light is None or state.light is before.light:
-        return state
-    return replace(state, light=light_from_json(light_to_json(state.light)))
 
 
 def state_files(project: Path) -> tuple[Path, ...]:
