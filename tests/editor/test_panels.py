@@ -19,7 +19,7 @@ from splatgraft.editor.project import Project
 from splatgraft.editor.relit_preview import RelitPreview
 from splatgraft.editor.session import Session
 from splatgraft.editor.state import read_state
-from splatgraft.project.metric_scale import MetricScale, read_scale, write_scale
+from splatgraft.project.metric_scale import MetricScale, read_scale, true_scale, write_scale
 from splatgraft.project.toml_edit import with_keys
 from splatgraft.relighting import LayerWeights
 
@@ -94,7 +94,8 @@ def test_the_object_s_height_is_shown_and_typed_in_centimetres(editor: Editor, w
     window.do("sets", "Scale of its photos")
     window.says("24 cm tall")
     assert session.objects()[0].target_from_object.scale == pytest.approx(2.0 * before.scale)
-    assert session.true_scale() == pytest.approx(2.0 * before.scale)
+    scales = (read_scale(session.files.cameras[side]) for side in ("source", "target"))
+    assert true_scale(*scales) == pytest.approx(2.0 * before.scale)
     # a broken file is named, and the rest of the step stays usable
     path = write_scale(session.files.cameras["target"], MetricScale(1.0, "a test"))
     path.write_text("{")

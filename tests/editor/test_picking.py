@@ -43,9 +43,9 @@ def camera() -> Cameras:
 def test_a_rectangle_selects_centres_that_project_into_it_and_none_behind_the_camera() -> None:
     # at distance 4 one unit is 25 px: x = 1 is at 125 of 200 px, z = 1 at 25 of 100 px
     means = torch.tensor([[1.0, 0, 1], [-1.0, 0, 1], [1.0, 0, -1], [0, -8.0, 0]])
-    found = in_rectangle(means, camera(), lower=(0.6, 0.2), upper=(0.65, 0.3))
+    found = in_rectangle(means, camera(), (0.65, 0.2), (0.6, 0.3))
     assert found.tolist() == [True, False, False, False]
-    assert not in_rectangle(means, camera(), lower=(0.0, 0.0), upper=(1.0, 1.0))[3]
+    assert not in_rectangle(means, camera(), (0.0, 0.0), (1.0, 1.0))[3]
 
 
 def test_a_ray_stops_at_the_first_opaque_surface() -> None:

@@ -65,7 +65,7 @@ class StateStore:
 
     def __init__(self, root: Path, *, project_folder: Path) -> None:
         """Open the store of the results in `root` without reading; objects' paths are relative to the project."""
-        self._folder, self._project_folder = root / EDITOR_FOLDER, project_folder
+        self._folder, self._conversions = root / EDITOR_FOLDER, _conversions(project_folder)
         self._states = self._folder / _STATES_FOLDER
         self._recent: OrderedDict[str, EditState] = OrderedDict()
 
@@ -89,7 +89,7 @@ class StateStore:
             content = self._file(name).read_bytes()
             if _name(content) != name:
                 raise ValueError(f"{self._file(name)}: expected an earlier state, found other bytes")
-            self._remember(name, _from_json(json.loads(content), self._project_folder))
+            self._remember(name, EditState(**self._converted(json.loads(content), 1)))
         self._recent.move_to_end(name)
         return self._recent[name]
 
@@ -113,10 +113,17 @@ class StateStore:
             stream.write(json.dumps(asdict(history)).encode())
 
     def _named(self, state: EditState) -> tuple[str, bytes]:
-        content = json.dumps(_to_json(state, self._project_folder), sort_keys=True).encode()
+        content = json.dumps(self._converted(vars(state), 0), sort_keys=True).encode()
         name = _name(content)
         self._remember(name, state)
         return name, content
+
+    def _converted(self, values: Mapping[str, Any], way: int) -> dict[str, Any]:
+        """Convert fields to JSON's types (0) or back (1); None stays None."""
+        pairs = self._conversions
+        return {
+            name: pairs[name][way](one) if name in pairs and one is not None else one for name, one in values.items()
+        }
 
     def _file(self, name: str) -> Path:
         return self._states / f"{name}.json"
@@ -127,35 +134,19 @@ class StateStore:
             self._recent.popitem(last=False)
 
 
-def _to_json(state: EditState, project_folder: Path) -> dict[str, Any]:
-    """Convert a state to JSON's types, by field; None stays None."""
-    convert: dict[str, Callable[[Any], Any]] = {
-        "objects": lambda objects: [object_to_json(item, project_folder) for item in objects],
-        "erased": _packed,
-        "corrections": _packed,
-        "prompts": prompts_to_json,
-        "light": light_to_json,
-        "weights": asdict,
-    }
-    return _converted(vars(state), convert)
-
-
-def _from_json(content: dict[str, Any], project_folder: Path) -> EditState:
-    convert: dict[str, Callable[[Any], Any]] = {
-        "objects": lambda objects: tuple(object_from_json(item, project_folder, "objects") for item in objects),
-        "erased": partial(_unpacked, kind=np.bool_),
-        "corrections": partial(_unpacked, kind=np.int8),
-        "box": tuple,
-        "prompts": partial(prompts_from_json, where="prompts"),
-        "light": light_from_json,
-        "weights": lambda weights: LayerWeights(**weights),
-    }
-    return EditState(**_converted(content, convert))
-
-
-def _converted(values: dict[str, Any], convert: Mapping[str, Callable[[Any], Any]]) -> dict[str, Any]:
+def _conversions(project_folder: Path) -> dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any]]]:
+    """Return the conversions of a state's fields to JSON's types and back; other fields have such types."""
     return {
-        name: value if value is None or name not in convert else convert[name](value) for name, value in values.items()
+        "objects": (
+            lambda items: [object_to_json(item, project_folder) for item in items],
+            lambda entries: tuple(object_from_json(entry, project_folder, "objects") for entry in entries),
+        ),
+        "erased": (_packed, partial(_unpacked, kind=np.bool_)),
+        "corrections": (_packed, partial(_unpacked, kind=np.int8)),
+        "box": (list, tuple),
+        "prompts": (prompts_to_json, partial(prompts_from_json, where="prompts")),
+        "light": (light_to_json, light_from_json),
+        "weights": (asdict, lambda weights: LayerWeights(**weights)),
     }
 
 

@@ -16,15 +16,15 @@ _CUTOFF_SIGMAS = 3.0
 
 
 def in_rectangle(
-    means: Float[Tensor, "n 3"], camera: Cameras, *, lower: tuple[float, float], upper: tuple[float, float]
+    means: Float[Tensor, "n 3"], camera: Cameras, corner: tuple[float, float], opposite: tuple[float, float]
 ) -> Bool[Tensor, "n"]:
     """Flag the centres that project into a rectangle of one camera's image, even occluded ones.
 
-    `lower` is its upper left corner, `upper` its lower right one, over the image's width and height.
+    Its corners are x and y over the image's width and height.
     """
     pixels, depth = camera.project(means)
-    share = pixels / camera.sizes[0].to(means)
-    inside = (share >= torch.tensor(lower)) & (share <= torch.tensor(upper))
+    share, corners = pixels / camera.sizes[0].to(means), torch.tensor([corner, opposite])
+    inside = (share >= corners.amin(0)) & (share <= corners.amax(0))
     return inside.all(1) & (depth > 0)
 
 

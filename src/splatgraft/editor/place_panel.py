@@ -33,7 +33,8 @@ from splatgraft.editor.placement import (
 from splatgraft.editor.state import check_height_cm
 from splatgraft.editor.stream import View
 from splatgraft.formats import SCENE_SUFFIXES, read_gaussians
-from splatgraft.project.layout import Side
+from splatgraft.project.layout import SIDES, Side
+from splatgraft.project.metric_scale import read_scale, true_scale
 from splatgraft.project.placement import ObjectPlacement
 from splatgraft.segmentation import Box
 
@@ -169,8 +170,8 @@ class PlacePanel(Panel):
         item = session.scenes.placeable_object(ObjectPlacement(Similarity.identity()))
         cameras = session.scenes.cameras("target")
         options = session.files.compose.options
-        # as `compose` does
-        options = replace(options, scale=session.true_scale()) if options.scale is None else options
+        if options.scale is None:  # as in `compose`
+            options = replace(options, scale=true_scale(*(read_scale(session.files.cameras[side]) for side in SIDES)))
         placed = suggest_placement(session.scenes.scene("target"), item, cameras, options)
         self._change(objects=(ObjectPlacement(placed.target_from_object),))
         doubts = " ".join(note.text for note in placed.warnings)
@@ -320,12 +321,8 @@ class PlacePanel(Panel):
         self._box = Box(centre - half, centre + half) if value else None
 
     def _erase(self) -> None:
-        session, box = self.session, self._box
-        assert box is not None
-        inside, before = (
-            box.contains(session.scenes.scene("target").means),
-            session.state.erased,
-        )
+        assert self._box is not None
+        inside, before = self._box.contains(self.session.scenes.scene("target").means), self.session.state.erased
         self._change(erased=inside if before is None else before | inside)
         self.editor.say("erased what is in the box" if bool(inside.any()) else "nothing is in the box")
 

@@ -137,10 +137,8 @@ class SelectPanel(Panel):
     def pointer(self, view: View, pointer: Pointer) -> None:
         """Handle clicks, strokes, rectangles and drags of the box."""
         if pointer.what == "rectangle":
-            camera = self.camera(view)
-            (x, y), (u, v) = pointer.place, pointer.to
-            lower, upper = (min(x, u), min(y, v)), (max(x, u), max(y, v))
-            inside = in_rectangle(self.session.scenes.scene("source").means, camera, lower=lower, upper=upper)
+            means = self.session.scenes.scene("source").means
+            inside = in_rectangle(means, self.camera(view), pointer.place, pointer.to)
             self._correct(inside, add=self._adds != pointer.alt)
         elif pointer.on in CORNERS:
             found = self.dragged_box(view, pointer, self.session.box())

@@ -107,7 +107,7 @@ class Server:
             WebSocketRoute("/socket", self._socket),
             Route("/{name:path}", self._page),
         ]
-        app = _Guard(Starlette(routes=routes), token)
+        app = _guarded(Starlette(routes=routes), token)
         config = uvicorn.Config(
             app, log_config=None, lifespan="off", ws="websockets-sansio", ws_max_size=_MAX_MESSAGE_BYTES,
             ws_per_message_deflate=False, timeout_graceful_shutdown=1, server_header=False, timeout_keep_alive=5,
@@ -222,19 +222,11 @@ def _pass_on(client: "Editor", window: Window, event: Any) -> None:
         sys.stderr.write(f"splatgraft: expected a message of the editor's own page, found {found}\n")
 
 
-class _Guard:
-    """Access control of an application's requests, and headers of its responses."""
+def _guarded(app: ASGIApp, token: str) -> ASGIApp:
+    """Return an application with access control of its requests, and with headers of its responses."""
 
-    def __init__(self, app: ASGIApp, token: str) -> None:
-        self._app, self._token = app, token
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        refused = why_refused(self._token, HTTPConnection(scope))
-        if refused is not None:
-            await _refusal(refused, 403)(scope, receive, send)
-            return
-
-        async def guarded(message: Any) -> None:
+    async def serve(scope: Scope, receive: Receive, send: Send) -> None:
+        async def send_with_headers(message: Any) -> None:
             if message["type"] == "http.response.start":
                 # reports and exported pages hold scripts of their own
                 is_file = scope["path"].startswith(f"/{FILES_PREFIX}")
@@ -242,7 +234,11 @@ class _Guard:
                 message["headers"] += [(name.encode(), value.encode()) for name, value in extra.items()]
             await send(message)
 
-        await self._app(scope, receive, guarded)
+        refused = why_refused(token, HTTPConnection(scope))
+        served = app if refused is None else _refusal(refused, 403)
+        await served(scope, receive, send_with_headers)
+
+    return serve
 
 
 def _listener(host: str, port: int) -> socket.socket:

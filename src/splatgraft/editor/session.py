@@ -17,14 +17,7 @@ from splatgraft.editor.pictures import Pictures
 from splatgraft.editor.placement import ObjectSize, PlaceableObject
 from splatgraft.editor.project import Project, ProjectFiles, in_words
 from splatgraft.editor.scene_cache import SceneCache
-from splatgraft.editor.state import (
-    EditState,
-    check_height_cm,
-    check_state,
-    read_state,
-    stamps_of,
-    write_state,
-)
+from splatgraft.editor.state import EditState, check_height_cm, check_state, read_state, stamps_of, write_state
 from splatgraft.project.layout import EDITOR_FOLDER, Side
 from splatgraft.project.metric_scale import MetricScale, read_scale, write_scale
 from splatgraft.project.placement import ObjectPlacement
@@ -217,11 +210,6 @@ class Session:
             for known in (own, read_scale(self.files.cameras["target"]))
         )
         return ObjectSize(item.target_from_object.scale, true_cm, cm_per_scale)
-
-    def true_scale(self) -> float | None:
-        """Return the scale that keeps the true size of the source's object; None if a capture's scale is unknown."""
-        own, place = read_scale(self.files.cameras["source"]), read_scale(self.files.cameras["target"])
-        return None if own is None or place is None else own.metres_per_unit / place.metres_per_unit
 
     def set_scale(self, index: int, cm: float, side: Side) -> Path:
         """Store the scale of a capture from the height of a placed object in it; return the file."""

@@ -50,6 +50,11 @@ def read_scale(capture: Path) -> MetricScale | None:
     return MetricScale(metres, str(content.get("source", "scale.json")))
 
 
+def true_scale(source: MetricScale | None, target: MetricScale | None) -> float | None:
+    """Return the size in the target over that in the source that keeps the true size; None if a scale is unknown."""
+    return None if source is None or target is None else source.metres_per_unit / target.metres_per_unit
+
+
 def write_scale(capture: Path, scale: MetricScale) -> Path:
     """Write the scale of a capture; returns the file.
 

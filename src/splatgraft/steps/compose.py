@@ -12,7 +12,7 @@ from splatgraft.folders.composite_folder import composite_of, placement_files, w
 from splatgraft.folders.picture_points import point_in_world
 from splatgraft.formats import read_cameras, read_gaussians, read_images
 from splatgraft.project.layout import COVERAGE_FILE
-from splatgraft.project.metric_scale import MetricScale, find_scale, read_scale
+from splatgraft.project.metric_scale import MetricScale, find_scale, read_scale, true_scale
 from splatgraft.project.placement import ObjectPlacement, Placement, read_placement
 from splatgraft.project.step import Context, Inputs
 from splatgraft.runtime.note import Note
@@ -89,8 +89,8 @@ class Compose:
             x, y, z = point_in_world(self.on, read_images(self.cameras), target, option="--on").tolist()
             options = replace(options, point=(x, y, z))
         in_metres = [read_scale(path) for path in (self.object_cameras, self.cameras)]
-        if options.scale is None and (own := in_metres[0]) is not None and (place := in_metres[1]) is not None:
-            options = replace(options, scale=own.metres_per_unit / place.metres_per_unit)
+        if options.scale is None:
+            options = replace(options, scale=true_scale(*in_metres))
         try:
             placed = place_object(target, object_, cameras=cameras, surroundings=surroundings, options=options)
         except NoFreePlaceError as error:
