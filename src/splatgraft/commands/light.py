@@ -105,8 +105,7 @@ class LightAt:
         """Return the step that would relight the target, for its input files and its given light."""
         root = self.target.parent if self.target.name == PROJECT_FILE else self.target
         if (root / PROJECT_FILE).is_file():
-            step = read_flow(root).steps["relight"]
-            assert isinstance(step, Relight)
+            step = read_flow(root).typed(Relight)
             return replace(step, placement=self.placement or step.placement, cameras=self.cameras or step.cameras)
         scene = self.target if is_scene(self.target) else self.target / SCENE_FILE
         if not scene.exists():

@@ -93,18 +93,11 @@ class Project:
     def files(self) -> ProjectFiles:
         """Read the project's files; raise ValueError if project.toml does not exist or is invalid."""
         flow = read_flow(self.file, self.out)
-        layout = flow.layout
-        segment, compose, relight = (flow.steps[name] for name in ("segment", "compose", "relight"))
-        source, target = (flow.steps[f"{side}/capture"] for side in SIDES)
-        assert isinstance(source, Capture)
-        assert isinstance(target, Capture)
-        assert isinstance(segment, Segment)
-        assert isinstance(compose, Compose)
-        assert isinstance(relight, Relight)
+        layout, compose = flow.layout, flow.typed(Compose)
         return ProjectFiles(
             file=self.file,
             root=layout.root,
-            scenes={"source": segment.scene, "target": compose.target},
+            scenes={"source": flow.typed(Segment).scene, "target": compose.target},
             cameras={side: layout.capture(side) / CAMERAS_FILE for side in SIDES},
             object=compose.object,
             surroundings=layout.object / SURROUNDINGS_FILE,
@@ -113,9 +106,9 @@ class Project:
             relit=layout.relit / SCENE_FILE,
             result=layout.result / SCENE_FILE,
             report=layout.report,
-            captures={"source": source, "target": target},
+            captures={side: flow.typed(Capture, f"{side}/capture") for side in SIDES},
             compose=compose,
-            relight=relight,
+            relight=flow.typed(Relight),
         )
 
     def reasons(self) -> Mapping[str, str | None]:

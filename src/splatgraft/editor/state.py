@@ -107,10 +107,8 @@ def _check_number(value: float, where: str, bounds: tuple[float, float]) -> None
 
 def read_state(project: Path) -> EditState:
     """Read the state from project.toml and the files beside it; raise ValueError, in one line, for an invalid file."""
-    content, steps, placement = read_toml(project), read_flow(project).steps, project.parent / PLACEMENT_FILE
-    segment, relight = steps["segment"], steps["relight"]
-    assert isinstance(segment, Segment)
-    assert isinstance(relight, Relight)
+    content, flow, placement = read_toml(project), read_flow(project), project.parent / PLACEMENT_FILE
+    segment, relight = flow.typed(Segment), flow.typed(Relight)
     values: dict[str, Any] = {key: getattr(segment, key) for key in _PLAIN_KEYS if key in content.get("segment", {})}
     if placement.is_file():
         found = read_placement(placement)

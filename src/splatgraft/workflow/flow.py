@@ -3,6 +3,7 @@
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 from splatgraft.project.layout import PLACEMENT_FILE, PROJECT_FILE, SIDES, Layout
 from splatgraft.project.project_file import ProjectFile, read_project_file
@@ -13,6 +14,8 @@ from splatgraft.steps.adopt import Adopt
 from splatgraft.steps.capture import Capture
 from splatgraft.steps.compose import Compose
 from splatgraft.steps.reconstruct import Reconstruct
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,12 @@ class Flow:
 
     def __iter__(self) -> Iterator[tuple[str, Step]]:
         return iter(self.steps.items())
+
+    def typed(self, kind: type[T], name: str = "") -> T:
+        """Return the step of a class; `name` says which one if both captures have one."""
+        step = self.steps[name or kind.__name__.lower()]
+        assert isinstance(step, kind)
+        return step
 
     def before(self, name: str) -> list[str]:
         """Return the steps whose results `name` reads."""

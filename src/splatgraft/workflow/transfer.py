@@ -82,8 +82,7 @@ def transfer(
     with atomic_write(file) as stream:
         stream.write(text.encode())
     run_project(root, to="consolidate")
-    step = read_flow(root).steps["relight"]
-    assert isinstance(step, Relight)
+    step = read_flow(root).typed(Relight)
     found = step.out / LIGHT_FILE
     return Transfer(
         project=root,
