@@ -22,7 +22,7 @@ from starlette.requests import HTTPConnection, Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketClose, WebSocketDisconnect
 
 from splatgraft.editor.access import cookie_name, why_refused
 from splatgraft.runtime.files import atomic_write
@@ -234,8 +234,10 @@ def _guarded(app: ASGIApp, token: str) -> ASGIApp:
                 message["headers"] += [(name.encode(), value.encode()) for name, value in extra.items()]
             await send(message)
 
-        refused = why_refused(token, HTTPConnection(scope))
-        served = app if refused is None else _refusal(refused, 403)
+        served, refused = app, why_refused(token, HTTPConnection(scope))
+        if refused is not None:
+            is_socket = scope["type"] == "websocket"
+            served = WebSocketClose(1008, refused) if is_socket else _refusal(refused, 403)  # a socket gets 403, too
         await served(scope, receive, send_with_headers)
 
     return serve
