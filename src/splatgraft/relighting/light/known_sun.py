@@ -1,7 +1,7 @@
 """The sun where it is known that there is one: by the clock of the photos, or out of doors.
 
 Out of doors the sun is known by a clear sky, whose brightness shows where it stands (`sky.py`), or as the brightest
-source that no camera saw.
+source that no camera saw. A clear sky also helps the clock.
 
 Clouds or walls may still hide the sun. So the sun's strength, its irradiance on level ground over that of
 all other light, has a posterior:
@@ -78,28 +78,24 @@ def known_sun(captured: CapturedScene, main: LightSource | None, *, outdoors: bo
         outdoors: Whether the scene is out of doors.
         is_unseen: Whether no camera saw `main`, so that it may be the sun.
     """
-    by_clock = direction_by_clock(captured.clock, main)
+    sky, is_clear = SkyEvidence.of(captured), 0.0
+    if outdoors:
+        above = FINE_DIRECTIONS[FINE_DIRECTIONS @ captured.up > LOWEST_SINE]
+        is_clear = float((sky.log_likelihoods(above).max() - _AS_LIKELY).sigmoid())
+    shows_sun, by_clock = is_clear > _IS_CLEAR, direction_by_clock(captured.clock, main)
+    name = "sun" if by_clock is None else BY_CLOCK
     if by_clock is not None:
-        return KnownSun(prior_near(by_clock[0][None], by_clock[1]), BY_CLOCK)
-    if not outdoors:
+        log_prior = prior_near(by_clock[0][None], by_clock[1])
+    elif outdoors and is_unseen and main is not None:
+        wrong = _SHADING_IS_WRONG if shows_sun else 0.0
+        log_prior = prior_near(torch.tensor([main.direction]), main.uncertainty_deg, wrong=wrong)
+    elif shows_sun:
+        return KnownSun(sky.log_likelihoods, name, min(is_clear, _MOST_CLEAR))
+    else:
         return None
-    sky, above = SkyEvidence.of(captured), FINE_DIRECTIONS[FINE_DIRECTIONS @ captured.up > LOWEST_SINE]
-    is_clear = float((sky.log_likelihoods(above).max() - _AS_LIKELY).sigmoid())
-    if is_clear < _IS_CLEAR:
-        return KnownSun(_prior_by_shading(main, wrong=0.0), "sun") if main is not None and is_unseen else None
-    by_shading = _prior_by_shading(main if is_unseen else None, wrong=_SHADING_IS_WRONG)
-
-    def log_prior(directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
-        return sky.log_likelihoods(directions) + by_shading(directions)
-
-    return KnownSun(log_prior, "sun", min(is_clear, _MOST_CLEAR))
-
-
-def _prior_by_shading(source: LightSource | None, *, wrong: float) -> LogPrior:
-    """Return the log density of the sun's direction by an estimated source; uniform without one."""
-    if source is None:
-        return lambda directions: torch.zeros(len(directions))
-    return prior_near(torch.tensor([source.direction]), source.uncertainty_deg, wrong=wrong)
+    if not shows_sun:
+        return KnownSun(log_prior, name)
+    return KnownSun(lambda these: log_prior(these) + sky.log_likelihoods(these), name, min(is_clear, _MOST_CLEAR))
 
 
 def sun_towards(
