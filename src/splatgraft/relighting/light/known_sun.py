@@ -54,7 +54,7 @@ class KnownSun:
     """Log density of its direction."""
     name: str
     """Name in reports."""
-    is_clear: float = _IS_CLEAR
+    is_clear: float
     """Probability of a clear sky."""
 
 
@@ -78,24 +78,25 @@ def known_sun(captured: CapturedScene, main: LightSource | None, *, outdoors: bo
         outdoors: Whether the scene is out of doors.
         is_unseen: Whether no camera saw `main`, so that it may be the sun.
     """
-    sky, is_clear = SkyEvidence.of(captured), 0.0
-    if outdoors:
-        above = FINE_DIRECTIONS[FINE_DIRECTIONS @ captured.up > LOWEST_SINE]
-        is_clear = float((sky.log_likelihoods(above).max() - _AS_LIKELY).sigmoid())
-    shows_sun, by_clock = is_clear > _IS_CLEAR, direction_by_clock(captured.clock, main)
-    name = "sun" if by_clock is None else BY_CLOCK
+    sky, is_clear = _clear_sky(captured) if outdoors else (None, _IS_CLEAR)
+    by_clock = direction_by_clock(captured.clock, main)
     if by_clock is not None:
-        log_prior = prior_near(by_clock[0][None], by_clock[1])
+        near, name = prior_near(by_clock[0][None], by_clock[1]), BY_CLOCK
     elif outdoors and is_unseen and main is not None:
-        wrong = _SHADING_IS_WRONG if shows_sun else 0.0
-        log_prior = prior_near(torch.tensor([main.direction]), main.uncertainty_deg, wrong=wrong)
-    elif shows_sun:
-        return KnownSun(sky.log_likelihoods, name, min(is_clear, _MOST_CLEAR))
+        wrong = 0.0 if sky is None else _SHADING_IS_WRONG
+        near, name = prior_near(torch.tensor([main.direction]), main.uncertainty_deg, wrong=wrong), "sun"
     else:
-        return None
-    if not shows_sun:
-        return KnownSun(log_prior, name)
-    return KnownSun(lambda these: log_prior(these) + sky.log_likelihoods(these), name, min(is_clear, _MOST_CLEAR))
+        return None if sky is None else KnownSun(sky.log_likelihoods, "sun", is_clear)
+    if sky is None:
+        return KnownSun(near, name, is_clear)
+    return KnownSun(lambda these: near(these) + sky.log_likelihoods(these), name, is_clear)
+
+
+def _clear_sky(captured: CapturedScene) -> tuple[SkyEvidence | None, float]:
+    """Return the sky, None if the views do not show a clear one, and the probability of a clear one."""
+    sky, above = SkyEvidence.of(captured), FINE_DIRECTIONS[FINE_DIRECTIONS @ captured.up > LOWEST_SINE]
+    is_clear = float((sky.log_likelihoods(above).max() - _AS_LIKELY).sigmoid())
+    return (sky, min(is_clear, _MOST_CLEAR)) if is_clear > _IS_CLEAR else (None, _IS_CLEAR)
 
 
 def sun_towards(

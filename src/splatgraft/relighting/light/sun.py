@@ -532,11 +532,11 @@ def prior_near(towards: Float[Tensor, "c 3"], error_deg: float, *, wrong: float 
         wrong: Probability that none is right.
     """
     error = math.radians(error_deg)
+    log_right, log_wrong = math.log((1 - wrong) / (len(towards) * error**2)), torch.tensor(wrong).log()
 
     def log_prior(directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
         away = (directions @ towards.T).clamp(-1, 1).acos() / error
-        density = torch.exp(-0.5 * away.square()).mean(1) / error**2
-        return ((1 - wrong) * density + wrong).log()
+        return torch.logaddexp((-0.5 * away.square()).logsumexp(1) + log_right, log_wrong)
 
     return log_prior
 
