@@ -481,7 +481,7 @@ ROWS: Mapping[str, Row] = {
         {"relighting.prepared_object.estimate_light": without_object},
     ),
     # surroundings
-    "clipped": Row("evidence", "white pixels may be brighter", {"relighting.light.panorama._CLIPPED": 2.0}),
+    "clipped": Row("evidence", "white pixels may be brighter", {"relighting.light.panorama.CLIPPED": 2.0}),
     "clipped-sources": Row(
         "radiance", "clipped patches may be sources", {"relighting.light.radiance_model._MAX_PATCHES": 0}
     ),
