@@ -542,6 +542,9 @@ ROWS: Mapping[str, Row] = {
         "the brightest unseen source out of doors is the sun",
         {"relighting.light.estimate._is_outdoors": lambda far, up: False},
     ),
+    "sun-sky": Row(
+        "sun", "a clear sky shows where the sun stands", {"relighting.light.known_sun._AS_LIKELY": math.inf}
+    ),
     "sun-strength": Row(
         "sun",
         "the sun's strength from shadow edges; that of the sources",

@@ -131,6 +131,7 @@ def test_wide_gaussians_close_by_are_not_smeared_over_the_horizon():
 
 
 REGION = BoundingSphere(torch.zeros(3), 1.0)
+ABOVE = even_directions(6400)[even_directions(6400) @ UP > 0.035]
 
 
 def high_views():
@@ -484,12 +485,12 @@ def test_shadows_that_prove_no_sun_move_one_that_exists():
     right, down = tangents(SUN)
     for aside in (right, -down):
         estimated = torch.nn.functional.normalize(SUN + math.tan(math.radians(12.0)) * aside, dim=0)
-        moved = sun_near(prior_near(estimated[None], 8.0), captured, region)
+        moved = sun_near(ABOVE, prior_near(estimated[None], 8.0)(ABOVE), captured, region)
         assert degrees_apart(moved.direction, SUN) < 3
         assert moved.error_deg < 4
     # without shadows nothing changes, up to the steps of the directions and the density that is left out
     nowhere = BoundingSphere(torch.tensor([20.0, 0.0, 0.3]), 0.3)
-    away = sun_near(prior_near(estimated[None], 8.0), captured, nowhere)
+    away = sun_near(ABOVE, prior_near(estimated[None], 8.0)(ABOVE), captured, nowhere)
     assert degrees_apart(away.direction, estimated) < 1
     assert away.error_deg == pytest.approx(8.0, rel=0.1)
     assert away.ratio is None
@@ -497,7 +498,7 @@ def test_shadows_that_prove_no_sun_move_one_that_exists():
 
 def test_shadows_of_a_sun_that_exists_show_its_strength():
     estimated = torch.nn.functional.normalize(SUN + math.tan(math.radians(12.0)) * tangents(SUN)[0], dim=0)
-    found = sun_near(prior_near(estimated[None], 8.0), under_sun(), BoundingSphere(torch.zeros(3), 0.8))
+    found = sun_near(ABOVE, prior_near(estimated[None], 8.0)(ABOVE), under_sun(), BoundingSphere(torch.zeros(3), 0.8))
     assert degrees_apart(found.direction, SUN) < 3
     assert found.ratio is not None
     assert found.ratio.tolist() == pytest.approx([3 * float(SUN[2])] * 3, rel=0.25)

@@ -92,7 +92,7 @@ def test_the_sun_is_known_by_the_clock_then_by_the_sky_then_by_the_brightest_sou
 
     def likeliest(scene: CapturedScene, *, is_unseen: bool = True, outdoors: bool = True) -> Tensor | None:
         known = known_sun(scene, main, outdoors=outdoors, is_unseen=is_unseen)
-        return None if known is None else ABOVE[known.log_prior(ABOVE).argmax()]
+        return None if known is None else known.directions[known.log_density.argmax()]
 
     for is_unseen in (True, False):  # a source that contradicts the sky is not followed
         found = likeliest(clear, is_unseen=is_unseen)
@@ -109,7 +109,7 @@ def test_the_sun_is_known_by_the_clock_then_by_the_sky_then_by_the_brightest_sou
     )
     assert known is not None
     assert known.name == BY_CLOCK
-    assert float(ABOVE[known.log_prior(ABOVE).argmax()] @ by_clock) > math.cos(math.radians(4))
+    assert float(known.directions[known.log_density.argmax()] @ by_clock) > math.cos(math.radians(4))
     # a clear sky makes a weak sun less probable, with a clock and without one
     for scene in (clear, CapturedScene(clear.gaussians, clear.cameras, clock_at(SUN))):
         sky = known_sun(scene, None, outdoors=True, is_unseen=False)

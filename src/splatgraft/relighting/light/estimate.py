@@ -160,7 +160,7 @@ def estimate_light(
         outdoors = _is_outdoors(evidence.far, captured.up)
         known = known_sun(captured, main, outdoors=outdoors, is_unseen=is_unseen)
         if known is not None:
-            shown = sun_near(known.log_prior, whole, region, name=known.name)
+            shown = sun_near(known.directions, known.log_density, whole, region, name=known.name)
             sun = shown if shown.ratio is not None else sun_towards(shown, known.is_clear, problem, evidence, rest)
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     found = EstimatedLight(mean, None, hidden, evidence, place)

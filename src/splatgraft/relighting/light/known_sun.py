@@ -20,12 +20,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.clock_sun import ClockSun, clock_directions
+from splatgraft.core.directions import even_directions
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import DIRECTIONS
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceProblem
 from splatgraft.relighting.light.sky import SkyEvidence
-from splatgraft.relighting.light.sun import ERROR_DEG, FINE_DIRECTIONS, LOWEST_SINE, LogPrior, Sun, prior_near
+from splatgraft.relighting.light.sun import ERROR_DEG, LOWEST_SINE, Sun, prior_near
 
 # a clear sky, fitted by benchmarks/fit_sky.py
 _CLEAR = 11.2  # strength of the sun over the sine of its height
@@ -33,6 +34,7 @@ _CLEAR_SD = 0.26  # standard deviation of the logarithm of that
 _TINT = (1.34, 0.97, 0.58)  # strength in red, green and blue over that in luminance
 
 # set by hand
+_DIRECTIONS = even_directions(6400)  # in which the sun may stand, 2.5 degrees apart
 _IS_CLEAR, _MOST_CLEAR = 0.5, 0.9  # probability of a clear sky if the views do not show it, and its maximum
 _AS_LIKELY = 3.0  # log likelihood of a clear sky at which it is as likely as not
 _SHADING_IS_WRONG = 0.3  # probability that the brightest source is not the sun, beside a clear sky
@@ -50,8 +52,10 @@ BY_CLOCK = "sun by the photos' clock"
 class KnownSun:
     """A sun that exists unless clouds or walls hide it."""
 
-    log_prior: LogPrior
-    """Log density of its direction."""
+    directions: Float[Tensor, "k 3"]
+    """Unit directions above the horizon."""
+    log_density: Float[Tensor, "k"]
+    """Log density of the sun's direction at each of `directions`."""
     name: str
     """Name in reports."""
     is_clear: float
@@ -78,25 +82,21 @@ def known_sun(captured: CapturedScene, main: LightSource | None, *, outdoors: bo
         outdoors: Whether the scene is out of doors.
         is_unseen: Whether no camera saw `main`, so that it may be the sun.
     """
-    sky, is_clear = _clear_sky(captured) if outdoors else (None, _IS_CLEAR)
+    above = _DIRECTIONS[_DIRECTIONS @ captured.up > LOWEST_SINE]
+    by_sky = SkyEvidence.of(captured).log_likelihoods(above) if outdoors else torch.zeros(len(above))
+    is_clear = min(float((by_sky.max() - _AS_LIKELY).sigmoid()), _MOST_CLEAR)
+    is_shown = is_clear > _IS_CLEAR
+    if not is_shown:
+        by_sky, is_clear = torch.zeros(len(above)), _IS_CLEAR
     by_clock = direction_by_clock(captured.clock, main)
     if by_clock is not None:
-        near, name = prior_near(by_clock[0][None], by_clock[1]), BY_CLOCK
-    elif outdoors and is_unseen and main is not None:
-        wrong = 0.0 if sky is None else _SHADING_IS_WRONG
-        near, name = prior_near(torch.tensor([main.direction]), main.uncertainty_deg, wrong=wrong), "sun"
-    else:
-        return None if sky is None else KnownSun(sky.log_likelihoods, "sun", is_clear)
-    if sky is None:
-        return KnownSun(near, name, is_clear)
-    return KnownSun(lambda these: near(these) + sky.log_likelihoods(these), name, is_clear)
-
-
-def _clear_sky(captured: CapturedScene) -> tuple[SkyEvidence | None, float]:
-    """Return the sky, None if the views do not show a clear one, and the probability of a clear one."""
-    sky, above = SkyEvidence.of(captured), FINE_DIRECTIONS[FINE_DIRECTIONS @ captured.up > LOWEST_SINE]
-    is_clear = float((sky.log_likelihoods(above).max() - _AS_LIKELY).sigmoid())
-    return (sky, min(is_clear, _MOST_CLEAR)) if is_clear > _IS_CLEAR else (None, _IS_CLEAR)
+        near_clock = prior_near(by_clock[0][None], by_clock[1])
+        return KnownSun(above, by_sky + near_clock(above), BY_CLOCK, is_clear)
+    if outdoors and is_unseen and main is not None:
+        wrong = _SHADING_IS_WRONG if is_shown else 0.0
+        near_main = prior_near(torch.tensor([main.direction]), main.uncertainty_deg, wrong=wrong)
+        return KnownSun(above, by_sky + near_main(above), "sun", is_clear)
+    return KnownSun(above, by_sky, "sun", is_clear) if is_shown else None
 
 
 def sun_towards(

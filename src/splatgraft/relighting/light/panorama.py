@@ -53,7 +53,8 @@ _DARKEST = 2e-3  # mean linear radiance below which a place has no light
 
 # surroundings
 _MIN_ALPHA = 0.3  # alpha below which a direction was not captured
-CLIPPED = 0.955  # sRGB of the brightest channel above which a photo may be clipped; reconstructed white is darker
+CLIPPED = 0.955
+"""sRGB of the brightest channel above which a photo may be clipped; reconstructed white is darker than 1."""
 
 
 @dataclass(frozen=True)

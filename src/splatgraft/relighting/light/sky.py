@@ -1,7 +1,7 @@
 """Direction of the sun from the brightness of a clear sky that the views of a capture show.
 
 A clear sky is brighter around the sun and towards the horizon. The models are the five clear skies of CIE S 011:2003
-(types 11 to 15); how bright the sky is as a whole is unknown. Views also show other things above the horizon, such as
+(types 11 to 15). The brightness of the whole sky is unknown. Views also show other things above the horizon, such as
 trees, so each direction shows either the sky or something of any brightness.
 """
 
@@ -17,6 +17,7 @@ from splatgraft.core.directions import even_directions
 from splatgraft.core.images import LUMINANCE, linear_from_srgb
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.panorama import CLIPPED
+from splatgraft.relighting.light.sun import LOWEST_SINE
 
 _SKIES = (  # CIE S 011: a and b of the gradation from zenith to horizon, c, d and e of the indicatrix around the sun
     (-1.0, -0.55, 10.0, -3.0, 0.45),
@@ -27,15 +28,14 @@ _SKIES = (  # CIE S 011: a and b of the gradation from zenith to horizon, c, d a
 )
 
 # set by hand
-_LOWEST_SINE = math.sin(math.radians(2.0))  # of the height of a direction that may show the sky
 _CELLS = even_directions(1600)  # directions into which pixels are sorted, 5 degrees apart
 _EVERY, _FEWEST = 3, 4  # stride of the pixels, and fewest pixels of a cell
 _SD = 0.2  # standard deviation of the logarithm of a sky's luminance
 _IS_SKY = 0.75  # prior probability that a cell shows the sky
 _ANY = 0.2  # density of the logarithm of the luminance of other things
 _TEMPERATURE = 8.0  # divisor of log likelihoods, because neighbouring cells share their errors
-_BRIGHTNESS = torch.arange(-5.0, 5.0, 0.1)  # logarithm of luminance over that of a sky of unit brightness
-_SKY_BRIGHTNESS = _BRIGHTNESS[20:-20:2]  # brightness of the sky as a whole, over the median of what is seen
+_BRIGHTNESS = torch.arange(-5.0, 5.0, 0.1)  # bins of the logarithm of a cell's luminance over that of the model
+_SKY_BRIGHTNESS = _BRIGHTNESS[20:-20:2]  # brightnesses of the whole sky that are tried, in the same unit
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class SkyEvidence:
         tree, cells, colors = KDTree(_CELLS.numpy()), [], []
         for camera, drawn in captured.views:
             rays = torch.nn.functional.normalize(camera.world_rays()[::_EVERY, ::_EVERY], dim=-1)
-            shown = (rays @ captured.up > _LOWEST_SINE) & (drawn.alpha[0, ::_EVERY, ::_EVERY] > 0.9)
+            shown = (rays @ captured.up > LOWEST_SINE) & (drawn.alpha[0, ::_EVERY, ::_EVERY] > 0.9)
             cells.append(torch.from_numpy(tree.query(rays[shown].numpy())[1]))
             colors.append(drawn.color[0, ::_EVERY, ::_EVERY][shown].clamp(0, 1))
         cell, color = torch.cat(cells), torch.cat(colors)
@@ -67,13 +67,15 @@ class SkyEvidence:
         counts = cell.unique(return_counts=True)[1]
         middle = order[counts.cumsum(0) - (counts + 1) // 2][counts >= _FEWEST]
         directions = _CELLS[cell[middle]]
-        sines = (directions @ captured.up).clamp_min(_LOWEST_SINE)
+        sines = (directions @ captured.up).clamp_min(LOWEST_SINE)
         return SkyEvidence(directions, log_luminance[middle], color[middle].amax(1) > CLIPPED, sines)
 
     def log_likelihoods(self, suns: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
-        """Compute the log likelihood of clear skies with the sun in k unit directions.
+        """Compare clear skies with the sun in k unit directions with brightness that does not depend on direction.
 
-        It is over the likelihood of cells whose brightness does not depend on their direction, and over `_TEMPERATURE`.
+        Returns:
+            Log likelihoods of the skies minus that without a sky, over `_TEMPERATURE`. They are 0 if the views show
+            nothing above the horizon.
         """
         if not len(self.directions):
             return torch.zeros(len(suns))
@@ -82,11 +84,11 @@ class SkyEvidence:
         return (found - self._without_sky()) / _TEMPERATURE
 
     def _under(self, sky: tuple[float, ...], cosines: Float[Tensor, "k b"]) -> Float[Tensor, "k"]:
-        """Compute the log likelihood under a type of sky, each at its best brightness.
+        """Compute the log likelihood of the cells under one type of sky, at its likeliest brightness.
 
         Args:
-            sky: Numbers of the CIE's model.
-            cosines: Of the angles between k suns and the cells.
+            sky: One of `_SKIES`.
+            cosines: Cosines of the angles between k suns and the cells.
         """
         a, b, c, d, e = sky
         gradation = 1 + a * (b / self.sines).exp()
@@ -107,7 +109,7 @@ class SkyEvidence:
         return total.amax(1)
 
     def _without_sky(self) -> float:
-        """Compute the log likelihood if the brightness of a cell is like that of any other cell."""
+        """Compute the log likelihood of the cells if each is as bright as any other."""
         seen, share = self.log_luminance[~self.clipped], self.clipped.float().mean()
         density = (-0.5 * ((seen[:, None] - seen) / _SD).square()).exp() / (_SD * math.sqrt(2 * math.pi))
         others = (density.sum(1) - density.diagonal()) / max(len(seen) - 1, 1)

@@ -72,8 +72,6 @@ _PROMISING = 10.0  # log likelihood over that of even light above which a direct
 _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
 _SURFACES = 2  # level surfaces whose shadows move a sun: a table, and the ground around it
 _STEP_DEG = 2.5  # of the grids of directions around a given one
-FINE_DIRECTIONS = even_directions(6400)
-"""Unit directions 2.5 degrees apart."""
 _IMPROBABLE = 4.5  # difference of log densities to the most probable direction, as at 3 standard errors
 _WIDER = 3.0  # radius of the second region: few things stand near a small object, but the sun is the same
 _TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a prior, because texels share their errors
@@ -391,12 +389,12 @@ class _ShadowEvidence:
 
         Returns:
             The direction; the log likelihood of its shadows over that of no sun, -inf if no direction is promising; and
-            this with the log prior.
+            this plus the log prior times `_TEMPERATURE`.
         """
         fine, surface = _Comparison.of(self.picture, _FINE), self.surface
         blurred_ambient = _blurred(self.ambient[None])
         without = max(0.0, float(fine.log_likelihoods(blurred_ambient)))
-        score = self.log_likelihoods(directions) + log_prior(directions)
+        score = self.log_likelihoods(directions) + _TEMPERATURE * log_prior(directions)
         best, likeliest, evidence = directions[0], -math.inf, -math.inf
         for _ in range(4):  # maxima that are refined
             if float(score.max()) < _PROMISING:
@@ -407,7 +405,7 @@ class _ShadowEvidence:
                 near = self.above(_around(mode, 3 * step, step))
                 shadows = _blurred(surface.shadows(self.standing, near))
                 found = fine.of_suns(shadows, blurred_ambient[0], _STRENGTHS) - without
-                posterior = found + log_prior(near)
+                posterior = found + _TEMPERATURE * log_prior(near)
                 i = int(posterior.argmax())
                 mode = near[i]
                 if float(posterior[i]) > likeliest:
@@ -477,14 +475,21 @@ def _lamp_near(sun: Sun, shown: _ShadowEvidence) -> Sun | None:
     return None if measured is None else replace(measured, distance=height / float(direction @ measured.normal))
 
 
-def sun_near(log_prior: LogPrior, captured: CapturedScene, region: BoundingSphere, *, name: str = "") -> Sun:
-    """Find the sun near a direction, when it is known that there is one.
+def sun_near(
+    directions: Float[Tensor, "k 3"],
+    log_density: Float[Tensor, "k"],
+    captured: CapturedScene,
+    region: BoundingSphere,
+    *,
+    name: str = "",
+) -> Sun:
+    """Find the direction of a sun that is known to exist, from shadows that may be too faint to prove a sun.
 
-    The density of its direction is the prior times the likelihoods of the shadows on each level surface in the wider
-    region. So shadows that alone prove no sun still show where it is.
+    The log likelihoods of the shadows on the largest level surfaces in the wider region are added to a given density.
 
     Args:
-        log_prior: Log density of the sun's direction without these shadows.
+        directions: Unit directions in which the sun may stand.
+        log_density: Log density of each without these shadows.
         captured: The scene with all objects that cast shadows during the capture.
         region: Sphere around the place.
         name: Name in reports.
@@ -494,12 +499,11 @@ def sun_near(log_prior: LogPrior, captured: CapturedScene, region: BoundingSpher
         its shadow.
     """
     surfaces = _ShadowEvidence.on_surfaces(captured, replace(region, radius=_WIDER * region.radius), most=_SURFACES)
-    near = FINE_DIRECTIONS[FINE_DIRECTIONS @ captured.up > LOWEST_SINE]
+    probable = log_density > -math.inf
     for one in surfaces:
-        near = one.above(near)
-    log_density = log_prior(near)
-    probable = log_density > log_density.max() - _IMPROBABLE
-    near = near[probable]
+        probable &= directions @ one.surface.plane.normal > LOWEST_SINE
+    probable &= log_density > log_density[probable].max() - _IMPROBABLE
+    near = directions[probable]
     log_density = sum((one.log_likelihoods(near) for one in surfaces), log_density[probable])
     weights = log_density.softmax(0)
     mean = F.normalize(weights @ near, dim=0)
@@ -519,8 +523,7 @@ def _prior_by_clock(clock: ClockSun | None) -> LogPrior:
     towards = clock_directions(clock)
     if clock is None or not len(towards):
         return lambda directions: torch.zeros(len(directions))
-    density = prior_near(towards, max(clock.error_deg, ERROR_DEG), wrong=_CLOCK_IS_WRONG)
-    return lambda directions: _TEMPERATURE * density(directions)
+    return prior_near(towards, max(clock.error_deg, ERROR_DEG), wrong=_CLOCK_IS_WRONG)
 
 
 def prior_near(towards: Float[Tensor, "c 3"], error_deg: float, *, wrong: float = 0.0) -> LogPrior:
@@ -562,8 +565,7 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
         near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, 2 * _BY_HAND_DEG, _STEP_DEG))
         if shown is None or not len(near):
             continue
-        log_prior = prior_near(direction[None], _BY_HAND_DEG, wrong=0.0)
-        found, evidence, _ = shown.best(near, lambda these, log_prior=log_prior: _TEMPERATURE * log_prior(these))
+        found, evidence, _ = shown.best(near, prior_near(direction[None], _BY_HAND_DEG))
         measured = _measured(shown, found, math.inf) if evidence > _PROMISING else None
         if measured is not None:
             return replace(measured, name=SET_BY_HAND)
