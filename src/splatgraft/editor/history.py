@@ -98,7 +98,8 @@ class StateStore:
         try:
             found = json.loads((self._folder / _HISTORY_FILE).read_text(encoding="utf-8"))
             history = History(tuple(found["names"]), found["at"])
-            used = {self._file(name) for name in (history.present, *history.names)}
+            _ = history.present  # LookupError if the position is outside of the names
+            used = {self._file(name) for name in history.names}
         except (OSError, ValueError, LookupError, TypeError):
             return None
         if not all(path.is_file() for path in used):

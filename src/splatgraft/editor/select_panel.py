@@ -213,7 +213,7 @@ class SelectPanel(Panel):
         self.editor.say(f"{'added' if add else 'removed'} what the stroke touched. {self._again('it')}")
 
     def _again(self, what: str) -> str:
-        """Say how to use what was clicked or brushed."""
+        """Return the sentence that names the button which uses new clicks or strokes (`what`)."""
         return "Press Cut out." if self.session.scenes.segmented() is None else f"Cut out again to use {what}."
 
     def key(self, view: View, key: str) -> bool:
