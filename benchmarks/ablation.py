@@ -543,7 +543,12 @@ ROWS: Mapping[str, Row] = {
         {"relighting.light.estimate._is_outdoors": lambda far, up: False},
     ),
     "sun-sky": Row(
-        "sun", "a clear sky shows where the sun stands", {"relighting.light.known_sun._AS_LIKELY": math.inf}
+        "sun", "a clear sky shows sun and sky", {"relighting.light.estimate.clear_sky_evidence": lambda captured: None}
+    ),
+    "sun-sky-radiance": Row(
+        "sun",
+        "the light of a clear sky from the sky that is seen; only the sun's direction",
+        {"relighting.light.sky.SkyEvidence.sky_with": lambda evidence, sun: None},
     ),
     "sun-strength": Row(
         "sun",

@@ -534,7 +534,7 @@ def test_a_direction_by_the_clock_is_averaged_with_a_source_that_may_be_the_sun(
 def test_shading_and_highlights_show_how_strong_a_sun_in_a_known_direction_is():
     unmeasured = Sun(SUN, 1.0, UP, None, 0.0, 5.0, BY_CLOCK)
     bright, hidden = (
-        sun_towards(unmeasured, 0.5, radiance_problem(found.evidence), found.evidence, found.rest())
+        sun_towards(unmeasured, None, radiance_problem(found.evidence), found.evidence, found.rest())
         for found in (estimate_of(under_sun()), estimate_of(under_sky()))
     )
     assert bright is not None

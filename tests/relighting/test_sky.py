@@ -1,19 +1,23 @@
 """The sun by the brightness of a clear sky, on skies of another model (Preetham et al. 1999)."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from shapes import clock_at, ring, surfels
+from shapes import UP, clock_at, ring, sunlit_scene, surfels
 from torch import Tensor
 
+from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.directions import even_directions
-from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import srgb_from_linear
+from splatgraft.core.gaussians import Gaussians, concatenate
+from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
+from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.relighting.captured_scene import CapturedScene
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.known_sun import BY_CLOCK, known_sun
 from splatgraft.relighting.light.light import LightSource
-from splatgraft.relighting.light.sky import SkyEvidence
+from splatgraft.relighting.light.sky import SkyEvidence, clear_sky_evidence
 
 SUN = torch.tensor([math.cos(math.radians(40)), 0.0, math.sin(math.radians(40))])
 ABOVE = even_directions(1600)[even_directions(1600)[:, 2] > 0.05]
@@ -29,15 +33,38 @@ def preetham(directions: Tensor, sun: Tensor, turbidity: float) -> Tensor:
     return (1 + a * torch.exp(b / directions[:, 2].clamp_min(0.02))) * around
 
 
-def dome(luminance: Tensor, directions: Tensor) -> Gaussians:
+GRAY = torch.ones(3)
+
+
+def dome(luminance: Tensor, directions: Tensor, *, tint: Tensor = GRAY) -> Gaussians:
     """A sphere around the cameras with this linear luminance in each direction, grey ground below the horizon."""
-    linear = torch.where(directions[:, 2] > 0, luminance, 0.1).clamp(0, 1)
-    colors = srgb_from_linear(linear[:, None].expand(-1, 3).contiguous())
-    return surfels(30 * directions, -directions, srgb=colors, width=0.6)
+    linear = torch.where(directions[:, 2:] > 0, luminance[:, None] * tint, 0.1).clamp(0, 1)
+    return surfels(30 * directions, -directions, srgb=srgb_from_linear(linear), width=0.6)
 
 
-def captured(luminance: Tensor, directions: Tensor) -> CapturedScene:
-    return CapturedScene(dome(luminance, directions), ring(height=1.0, radius=2.0, focal=50.0))
+def captured(luminance: Tensor, directions: Tensor, *, tint: Tensor = GRAY) -> CapturedScene:
+    return CapturedScene(dome(luminance, directions, tint=tint), ring(height=1.0, radius=2.0, focal=50.0))
+
+
+def garden(albedo: float, strength: float) -> tuple[CapturedScene, Tensor]:
+    """A hedge around balls on a floor, under a clear sky and a sun; returns the irradiance on level ground, too.
+
+    `strength` is the sun's irradiance on level ground over the sky's.
+    """
+    directions = even_directions(12000)
+    above = directions[:, 2] > 0
+    luminance = 0.06 * preetham(directions, SUN, 3.0)
+    sky = (luminance * directions[:, 2])[above].sum() * 4 * math.pi / len(directions)
+    near = sunlit_scene(SUN, strength / float(SUN[2]))
+    lit = linear_from_srgb(rgb_from_dc(near.sh[:, 0])) / 0.15  # over the light of the sky
+    colors = srgb_from_linear((albedo * sky / math.pi * lit).clamp(0, 1))
+    near = replace(near, sh=dc_from_rgb(colors)[:, None])
+    turn, height = torch.meshgrid(torch.arange(90) / 90 * 2 * math.pi, torch.linspace(0, 1.2, 5), indexing="ij")
+    turn, height = turn.flatten(), height.flatten()
+    around = torch.stack([turn.cos(), turn.sin(), 0 * turn], 1)
+    hedge = surfels(9 * around + height[:, None] * UP, -around, srgb=0.2, width=0.3)
+    scene = concatenate([near, hedge, dome(luminance, directions).select(above)])
+    return CapturedScene(scene, ring(height=1.5, radius=2.5, focal=50.0)), sky * (1 + strength)
 
 
 def azimuth_deg(direction: Tensor) -> float:
@@ -91,7 +118,8 @@ def test_the_sun_is_known_by_the_clock_then_by_the_sky_then_by_the_brightest_sou
     main = LightSource((0.0, math.cos(0.7), math.sin(0.7)), (1.0, 1.0, 1.0), uncertainty_deg=6.0)
 
     def likeliest(scene: CapturedScene, *, is_unseen: bool = True, outdoors: bool = True) -> Tensor | None:
-        known = known_sun(scene, main, outdoors=outdoors, is_unseen=is_unseen)
+        sky = clear_sky_evidence(scene) if outdoors else None
+        known = known_sun(scene, main, sky, outdoors=outdoors, is_unseen=is_unseen)
         return None if known is None else known.directions[known.log_density.argmax()]
 
     for is_unseen in (True, False):  # a source that contradicts the sky is not followed
@@ -104,14 +132,36 @@ def test_the_sun_is_known_by_the_clock_then_by_the_sky_then_by_the_brightest_sou
     assert likeliest(grey, is_unseen=False) is None
     assert likeliest(clear, outdoors=False) is None
     by_clock = torch.tensor([0.0, 0.6, 0.8])
-    known = known_sun(
-        CapturedScene(clear.gaussians, clear.cameras, clock_at(by_clock)), None, outdoors=False, is_unseen=False
-    )
+    timed = CapturedScene(clear.gaussians, clear.cameras, clock_at(by_clock))
+    known = known_sun(timed, None, None, outdoors=False, is_unseen=False)
     assert known is not None
     assert known.name == BY_CLOCK
     assert float(known.directions[known.log_density.argmax()] @ by_clock) > math.cos(math.radians(4))
-    # a clear sky makes a weak sun less probable, with a clock and without one
-    for scene in (clear, CapturedScene(clear.gaussians, clear.cameras, clock_at(SUN))):
-        sky = known_sun(scene, None, outdoors=True, is_unseen=False)
-        assert sky is not None
-        assert sky.is_clear > known.is_clear
+
+
+@pytest.mark.parametrize("turbidity", [2.0, 4.0])
+def test_the_strip_of_a_clear_sky_that_the_views_show_tells_how_bright_the_whole_is(turbidity):
+    directions = even_directions(12000)
+    above = directions[:, 2] > 0
+    relative = preetham(directions, SUN, turbidity)
+    luminance = 0.3 * relative / relative[above].median()
+    blue = torch.tensor([0.7, 1.0, 1.5])
+    sky = SkyEvidence.of(captured(luminance, directions, tint=blue)).sky_with(SUN)
+
+    def on_level_ground(radiance: Tensor) -> Tensor:
+        return (radiance * directions[:, 2:])[above].sum(0) * 4 * math.pi / len(directions)
+
+    found = on_level_ground(sky.radiance(directions))
+    true = on_level_ground(luminance[:, None] * blue)
+    assert float((found / true).log2().abs().max()) < 0.5  # stops
+
+
+def test_under_a_clear_sky_the_level_of_the_light_does_not_depend_on_the_colour_of_the_ground():
+    found = []
+    for albedo in (0.05, 0.3):
+        scene, irradiance = garden(albedo, 8.0)
+        light = estimate_light(scene, BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3))
+        assert isinstance(light, EstimatedLight)
+        found.append(float((light.light.irradiance(UP[None])[0] @ LUMINANCE / irradiance).log2()))
+    assert max(map(abs, found)) < 0.8  # stops; the edges of the shadows show a third or less of the sun's strength
+    assert abs(found[0] - found[1]) < 0.4

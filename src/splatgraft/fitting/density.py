@@ -23,9 +23,6 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.fitting.gaussian_fit import FitState, Step
 from splatgraft.rendering import view_operator
 
-ERROR_EVERY = 4
-"""Usual number of steps between two measurements of the error that each Gaussian covers."""
-
 # set by hand unless a source is named
 _DEAD_OPACITY = 0.005  # opacity below which a Gaussian is removed (3DGS, Sec. 5)
 _SHIFT = 0.5  # distance of the children from the parent's centre, in the parent's longest standard deviation
@@ -54,7 +51,7 @@ class DensityControl:
     """Step after which no Gaussian is added or removed."""
     camera_centers: Float[Tensor, "v 3"]
     """Camera positions, world units; their distance bounds the scale of a Gaussian."""
-    error_every: int = 0
+    error_every: int = 4
     """Steps between two measurements of the covered error; 0 leaves the error out of the score."""
 
     def allowed(self, iteration: int) -> int:

@@ -39,16 +39,14 @@ class _Preset:
     budget: int
     longest_side_px: int
     sampling: tuple[Sampling, ...] = SPARSE
-    beyond_draft: bool = False
-    """See `ReconstructOptions.beyond_draft`; false at `draft`, because the light estimate was fitted on such scenes."""
 
 
 _PRESETS: dict[str, _Preset] = {
     "draft": _Preset(1_000, 25_000, 640),
-    "standard": _Preset(4_000, 100_000, 960, beyond_draft=True),
-    "high": _Preset(10_000, 100_000, 960, beyond_draft=True),
+    "standard": _Preset(4_000, 100_000, 960),
+    "high": _Preset(10_000, 100_000, 960),
     # 3DGS's length and the usual size of images
-    "full": _Preset(30_000, 1_000_000, 1600, EVERY_PIXEL, beyond_draft=True),
+    "full": _Preset(30_000, 1_000_000, 1600, EVERY_PIXEL),
 }
 
 
@@ -105,15 +103,6 @@ class ReconstructOptions:
         """Largest number of Gaussians, given or from the preset."""
         return _PRESETS[self.quality].budget if self.budget is None else self.budget
 
-    @property
-    def beyond_draft(self) -> bool:
-        """Whether the fit uses the methods that are off at `draft`.
-
-        Splits depend also on the error that a Gaussian covers. If the photos show surroundings, a far shell lies behind
-        the scene, and every step has a random background, so that dark surfaces get no holes.
-        """
-        return _PRESETS[self.quality].beyond_draft
-
     def sampling(self, served: Cameras) -> tuple[Sampling, ...]:
         """Return the schedule of the fitted pixels for the served views.
 
@@ -143,10 +132,9 @@ _BYTES_PER_PIXEL = 160  # of the largest view: colour, transmittance, loss and t
 _BYTES_PER_GAUSSIAN = 1500  # projections, tile lists and their gradients
 
 # CPU seconds of one step; fitted to runs of 1000 to 4000 steps on an AMD EPYC at 3 GHz (docs/results.md)
-_STEP_SECONDS = 6e-3
-_SECONDS_PER_GAUSSIAN = 1.0e-6  # projection, colours, Adam
-_SECONDS_PER_PIXEL = 0.3e-6  # blending and loss
-_ERROR_SHARE = 0.1  # time that measuring the covered error adds, over the sum of the others
+_STEP_SECONDS = 6.6e-3
+_SECONDS_PER_GAUSSIAN = 1.1e-6  # projection, colours, Adam
+_SECONDS_PER_PIXEL = 0.33e-6  # blending and loss
 
 
 def predict_memory(capture: PosedImages, options: ReconstructOptions) -> int:
@@ -209,7 +197,7 @@ def predict_cpu_seconds(cameras: Cameras, options: ReconstructOptions) -> float:
     # on average about a sixth less than the budget, which is reached late
     gaussians = options.max_gaussians * 5 / 6
     step = _STEP_SECONDS + _SECONDS_PER_GAUSSIAN * gaussians + _SECONDS_PER_PIXEL * pixels
-    return options.all_iterations * step * (1 + _ERROR_SHARE * options.beyond_draft)
+    return options.all_iterations * step
 
 
 def describe_duration(seconds: float) -> str:

@@ -17,7 +17,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.posed_images import PosedImages, held_out
-from splatgraft.fitting.density import ERROR_EVERY, DensityControl
+from splatgraft.fitting.density import DensityControl
 from splatgraft.fitting.gaussian_fit import FitOptions, FitState, LearningRates, Step, fit
 from splatgraft.fitting.surface_loss import SurfaceLoss
 from splatgraft.reconstruction.image_pyramid import read_pyramid
@@ -79,7 +79,7 @@ def reconstruct(
     capture = options.served(capture)
     views = read_pyramid(capture, options.sampling(capture.cameras), device=options.device, progress=progress)
     small = views.reduced(_SMALL_SIDE_PX)
-    surroundings = options.beyond_draft and shows_surroundings(small[1], options.background)
+    surroundings = shows_surroundings(small[1], options.background)
     start = _start(capture, small, options, far_shell=surroundings, progress=progress).to(options.device)
     density = DensityControl(
         budget=options.max_gaussians,
@@ -88,7 +88,6 @@ def reconstruct(
         full_at=int(_FULL_AT * options.all_iterations),
         stop=int(_STOP_AT * options.all_iterations),
         camera_centers=capture.cameras.centers.to(options.device),
-        error_every=ERROR_EVERY if options.beyond_draft else 0,
     )
     band_every = max(1, options.all_iterations // _BAND_SHARE)
 

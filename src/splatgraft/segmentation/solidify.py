@@ -23,7 +23,7 @@ from torch import Tensor
 
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.fitting.density import ERROR_EVERY, DensityControl
+from splatgraft.fitting.density import DensityControl
 from splatgraft.fitting.gaussian_fit import FitOptions, LearningRates, View, fit
 from splatgraft.fitting.surface_loss import SurfaceLoss
 from splatgraft.rendering import RenderOptions, render, view_operator
@@ -183,7 +183,6 @@ def _density(chosen: Gaussians, views: Sequence[View], cameras: Cameras, options
         full_at=int(_FULL_AT * options.iterations),
         stop=int(_STOP_AT * options.iterations),
         camera_centers=cameras.centers,
-        error_every=ERROR_EVERY,
     )
 
 

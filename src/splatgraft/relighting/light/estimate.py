@@ -24,7 +24,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import LUMINANCE
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.evidence import find_highlights, find_shading_evidence
-from splatgraft.relighting.light.known_sun import known_sun, sun_towards
+from splatgraft.relighting.light.known_sun import clear_ratio, known_sun, sun_towards
 from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
@@ -38,6 +38,7 @@ from splatgraft.relighting.light.panorama import (
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
+from splatgraft.relighting.light.sky import ClearSky, clear_sky_evidence
 from splatgraft.relighting.light.sun import UNSEEN_RADIUS_DEG, Point, Sun, find_sun, set_sun, sun_near, with_sun
 from splatgraft.rendering import render
 
@@ -74,6 +75,8 @@ class EstimatedLight:
     one."""
     hidden: RadianceEstimate
     """Radiance that no camera recorded."""
+    sky: ClearSky | None
+    """The clear sky that is part of `hidden`; None if the views show none."""
     evidence: LightEvidence
     """Evidence for the estimate."""
     place: BoundingSphere
@@ -82,7 +85,7 @@ class EstimatedLight:
     @property
     def light(self) -> Light:
         """The estimate, including the sun."""
-        return self.mean if self.sun is None else with_sun(self.mean, self.sun)
+        return self.mean if self.sun is None else with_sun(self.mean, self.sun, is_added=self.sky is not None)
 
     def rest(self) -> Float[Tensor, "k 3"]:
         """Return the linear rgb radiance of all `DIRECTIONS` without the sources, to which ambient light is fitted."""
@@ -94,7 +97,9 @@ class EstimatedLight:
         The surface of `scene` at which the view towards the sun ends, such as a window's pane, does not block it.
         """
         named = replace(sun, name=sun.name or ("lamp" if math.isfinite(sun.distance) else self._name_at(sun.direction)))
-        placed = with_blocker_distances(with_sun(self.mean, named), scene, self.place)
+        if self.sky is not None and sun.ratio is None:
+            named = replace(named, ratio=clear_ratio(float(sun.direction @ self.sky.up)))
+        placed = with_blocker_distances(replace(self, sun=named).light, scene, self.place)
         return replace(self, sun=replace(named, blockers_within=placed.sources[0].blockers_within))
 
     def _name_at(self, direction: Float[Tensor, "3"]) -> str:
@@ -153,17 +158,24 @@ def estimate_light(
     problem = radiance_problem(evidence)
     hidden = search_radiance(problem)
     sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
-    main = next(iter(sources), None)
-    sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region)
+    outdoors = _is_outdoors(evidence.far, captured.up)
+    sky = clear_sky_evidence(captured) if outdoors else None
+    sun, known = set_sun(sun_through, whole) if sun_through else find_sun(whole, region), None
     if sun is None:
+        main = next(iter(sources), None)
         is_unseen = main is not None and main.name in _UNSEEN_NAMES
-        outdoors = _is_outdoors(evidence.far, captured.up)
-        known = known_sun(captured, main, outdoors=outdoors, is_unseen=is_unseen)
-        if known is not None:
-            shown = sun_near(known.directions, known.log_density, whole, region, name=known.name)
-            sun = shown if shown.ratio is not None else sun_towards(shown, known.is_clear, problem, evidence, rest)
+        known = known_sun(captured, main, sky, outdoors=outdoors, is_unseen=is_unseen)
+        sun = None if known is None else sun_near(known.directions, known.log_density, whole, region, name=known.name)
+    clear = None if sky is None or sun is None else sky.sky_with(sun.direction)
+    if clear is not None and sun is not None:
+        hidden = hidden.under(clear)
+        sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
+        # the sky tells the strength better than the edges of shadows, where Gaussians mix lit and shaded
+        sun = replace(sun, ratio=None, name=sun.name or "sun")
+    if known is not None and sun is not None and sun.ratio is None:
+        sun = sun_towards(sun, sky, problem, evidence, rest)
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
-    found = EstimatedLight(mean, None, hidden, evidence, place)
+    found = EstimatedLight(mean, None, hidden, clear, evidence, place)
     return found if sun is None else found.with_sun(sun, scene)
 
 

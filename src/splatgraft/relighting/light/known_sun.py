@@ -20,12 +20,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatgraft.core.clock_sun import ClockSun, clock_directions
-from splatgraft.core.directions import even_directions
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import DIRECTIONS
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceProblem
-from splatgraft.relighting.light.sky import SkyEvidence
+from splatgraft.relighting.light.sky import SUNS, SkyEvidence
 from splatgraft.relighting.light.sun import ERROR_DEG, LOWEST_SINE, Sun, prior_near
 
 # a clear sky, fitted by benchmarks/fit_sky.py
@@ -34,9 +33,7 @@ _CLEAR_SD = 0.26  # standard deviation of the logarithm of that
 _TINT = (1.34, 0.97, 0.58)  # strength in red, green and blue over that in luminance
 
 # set by hand
-_DIRECTIONS = even_directions(6400)  # in which the sun may stand, 2.5 degrees apart
-_IS_CLEAR, _MOST_CLEAR = 0.5, 0.9  # probability of a clear sky if the views do not show it, and its maximum
-_AS_LIKELY = 3.0  # log likelihood of a clear sky at which it is as likely as not
+_IS_CLEAR = 0.5  # probability of a clear sky if the views do not show it
 _SHADING_IS_WRONG = 0.3  # probability that the brightest source is not the sun, beside a clear sky
 _STRENGTHS = torch.logspace(-2, 1.4, 35, dtype=torch.float64)
 _LEAST = 0.1  # strength below which the sun is hidden
@@ -58,8 +55,6 @@ class KnownSun:
     """Log density of the sun's direction at each of `directions`."""
     name: str
     """Name in reports."""
-    is_clear: float
-    """Probability of a clear sky."""
 
 
 def direction_by_clock(clock: ClockSun | None, main: LightSource | None) -> tuple[Float[Tensor, "3"], float] | None:
@@ -73,40 +68,48 @@ def direction_by_clock(clock: ClockSun | None, main: LightSource | None) -> tupl
     return _joined(directions[0], clock.error_deg, main) if clock is not None and len(directions) else None
 
 
-def known_sun(captured: CapturedScene, main: LightSource | None, *, outdoors: bool, is_unseen: bool) -> KnownSun | None:
+def known_sun(
+    captured: CapturedScene, main: LightSource | None, sky: SkyEvidence | None, *, outdoors: bool, is_unseen: bool
+) -> KnownSun | None:
     """Find out whether there is a sun unless something hides it, and where it may stand.
 
     Args:
         captured: The scene.
         main: Brightest estimated source.
+        sky: A clear sky; None if the views do not show one.
         outdoors: Whether the scene is out of doors.
         is_unseen: Whether no camera saw `main`, so that it may be the sun.
     """
-    above = _DIRECTIONS[_DIRECTIONS @ captured.up > LOWEST_SINE]
-    by_sky = SkyEvidence.of(captured).log_likelihoods(above) if outdoors else torch.zeros(len(above))
-    is_clear = min(float((by_sky.max() - _AS_LIKELY).sigmoid()), _MOST_CLEAR)
-    is_shown = is_clear > _IS_CLEAR
-    if not is_shown:
-        by_sky, is_clear = torch.zeros(len(above)), _IS_CLEAR
+    above = SUNS[SUNS @ captured.up > LOWEST_SINE]
+    by_sky = torch.zeros(len(above)) if sky is None else sky.log_likelihood
     by_clock = direction_by_clock(captured.clock, main)
     if by_clock is not None:
         near_clock = prior_near(by_clock[0][None], by_clock[1])
-        return KnownSun(above, by_sky + near_clock(above), BY_CLOCK, is_clear)
+        return KnownSun(above, by_sky + near_clock(above), BY_CLOCK)
     if outdoors and is_unseen and main is not None:
-        wrong = _SHADING_IS_WRONG if is_shown else 0.0
+        wrong = 0.0 if sky is None else _SHADING_IS_WRONG
         near_main = prior_near(torch.tensor([main.direction]), main.uncertainty_deg, wrong=wrong)
-        return KnownSun(above, by_sky + near_main(above), "sun", is_clear)
-    return KnownSun(above, by_sky, "sun", is_clear) if is_shown else None
+        return KnownSun(above, by_sky + near_main(above), "sun")
+    return None if sky is None else KnownSun(above, by_sky, "sun")
+
+
+def clear_ratio(sine: float) -> Float[Tensor, "3"]:
+    """Return the most probable irradiance of the sun over that of all other light, under a clear sky.
+
+    Args:
+        sine: Sine of the sun's height.
+    """
+    return _CLEAR * max(sine, LOWEST_SINE) * torch.tensor(_TINT)
 
 
 def sun_towards(
-    sun: Sun, is_clear: float, problem: RadianceProblem, evidence: LightEvidence, rest: Float[Tensor, "k 3"]
+    sun: Sun, sky: SkyEvidence | None, problem: RadianceProblem, evidence: LightEvidence, rest: Float[Tensor, "k 3"]
 ) -> Sun | None:
     """Estimate the strength of a sun in a known direction.
 
     Args:
-        sun: The sun, without a ratio.
-        is_clear: Probability of a clear sky.
+        sun: The sun; its ratio is not read.
+        sky: A clear sky; None if the views do not show one.
         problem: Density of the light at the place.
         evidence: Evidence that `problem` is made of.
         rest: Estimated radiance from all `DIRECTIONS` without the sources.
@@ -114,7 +117,7 @@ def sun_towards(
     Returns:
         The sun with its ratio; None if the evidence is against a sun there.
     """
-    log_posterior = _log_prior(float(sun.direction @ evidence.up), is_clear)
+    log_posterior = _log_prior(float(sun.direction @ evidence.up), _IS_CLEAR if sky is None else sky.is_clear)
     log_posterior -= _costs(problem, evidence, rest, sun.direction) / problem.settings.temperature
     strength = float(_STRENGTHS[log_posterior.argmax()])
     if strength < _LEAST:

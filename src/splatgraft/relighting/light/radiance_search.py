@@ -24,6 +24,7 @@ from splatgraft.relighting.light.radiance_model import (
     start,
     unseen_cost,
 )
+from splatgraft.relighting.light.sky import ClearSky
 
 _RELEVELED = 0.7  # share of the mean residual that albedos absorb before a state is polished
 _MIN_SHARE = 0.1  # minimum unknown share of a direction that may contain a lamp
@@ -45,11 +46,11 @@ class Maximum:
 
 @dataclass(frozen=True)
 class RadianceEstimate:
-    """Radiance around a place that no camera recorded: means over the posterior, gray, for each direction."""
+    """Linear rgb radiance around a place that no camera recorded, for each direction."""
 
-    unseen: Float[Tensor, "k"]
+    unseen: Float[Tensor, "k 3"]
     """Radiance of each direction's unseen part."""
-    clipped: Float[Tensor, "k"]
+    clipped: Float[Tensor, "k 3"]
     """Radiance of each direction's clipped part beyond the camera's white."""
     residual: Float[Tensor, "m"]
     """Logarithm of observed over explained brightness of the receivers at the best maximum."""
@@ -57,15 +58,22 @@ class RadianceEstimate:
     def radiance(self, evidence: LightEvidence) -> Float[Tensor, "k 3"]:
         """Compute the linear rgb radiance from all `DIRECTIONS` at the object.
 
-        Unseen light is white, because cameras balance their white to it.
-
         Args:
             evidence: Evidence at the object, whose near surroundings may differ from those of the estimate.
         """
         around = evidence.around
-        # clipped parts are white, too, because their tint was lost
-        white = (1 - around.seen).clamp_min(0) * self.unseen + evidence.visible_sources * self.clipped
-        return around.radiance + white[:, None]
+        unseen = (1 - around.seen).clamp_min(0)[:, None] * self.unseen
+        return around.radiance + unseen + evidence.visible_sources[:, None] * self.clipped
+
+    def under(self, sky: ClearSky) -> "RadianceEstimate":
+        """Take the radiance of the directions above the horizon from a clear sky."""
+        above, radiance = (DIRECTIONS @ sky.up > 0)[:, None], sky.radiance(DIRECTIONS)
+        clipped = (radiance - 1).clamp_min(0)
+        return replace(
+            self,
+            unseen=torch.where(above, radiance, self.unseen),
+            clipped=torch.where(above, clipped, self.clipped),
+        )
 
 
 def search_radiance(problem: RadianceProblem) -> RadianceEstimate:
@@ -91,9 +99,11 @@ def search_radiance(problem: RadianceProblem) -> RadianceEstimate:
     for weight, maximum in zip(weights, maxima, strict=True):
         hidden += weight * _hidden_radiance(problem, maximum)
     _, at_best, albedo = problem.split(maxima[0].state)
+    # white, because cameras balance their white to unseen light, and because clipped parts have lost their tint
+    unseen, clipped = hidden.float()[..., None].expand(-1, -1, 3)
     return RadianceEstimate(
-        unseen=hidden[0].float(),
-        clipped=hidden[1].float(),
+        unseen=unseen,
+        clipped=clipped,
         residual=problem.residual(at_best, albedo).float(),
     )
 

@@ -1,4 +1,4 @@
-"""Direction of the sun from the brightness of a clear sky that the views of a capture show.
+"""Direction of the sun, and radiance of the whole sky, from the part of a clear sky that the views of a capture show.
 
 A clear sky is brighter around the sun and towards the horizon. The models are the five clear skies of CIE S 011:2003
 (types 11 to 15). The brightness of the whole sky is unknown. Views also show other things above the horizon, such as
@@ -7,6 +7,7 @@ trees, so each direction shows either the sky or something of any brightness.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,6 +20,8 @@ from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.panorama import CLIPPED
 from splatgraft.relighting.light.sun import LOWEST_SINE
 
+SUNS = even_directions(6400)
+"""Directions in which the sun may stand, 2.5 degrees apart."""
 _SKIES = (  # CIE S 011: a and b of the gradation from zenith to horizon, c, d and e of the indicatrix around the sun
     (-1.0, -0.55, 10.0, -3.0, 0.45),
     (-1.0, -0.32, 10.0, -3.0, 0.45),
@@ -33,23 +36,82 @@ _EVERY, _FEWEST = 3, 4  # stride of the pixels, and fewest pixels of a cell
 _SD = 0.2  # standard deviation of the logarithm of a sky's luminance
 _IS_SKY = 0.75  # prior probability that a cell shows the sky
 _ANY = 0.2  # density of the logarithm of the luminance of other things
+_AS_LIKELY = 3.0  # log likelihood of a clear sky at which it is as likely as not
+_MOST_CLEAR = 0.9  # maximum probability of a clear sky
 _TEMPERATURE = 8.0  # divisor of log likelihoods, because neighbouring cells share their errors
 _BRIGHTNESS = torch.arange(-5.0, 5.0, 0.1)  # bins of the logarithm of a cell's luminance over that of the model
 _SKY_BRIGHTNESS = _BRIGHTNESS[20:-20:2]  # brightnesses of the whole sky that are tried, in the same unit
 
 
 @dataclass(frozen=True)
+class ClearSky:
+    """A clear sky of the CIE."""
+
+    kind: tuple[float, ...]
+    """One of `_SKIES`."""
+    sun: Float[Tensor, "3"]
+    """Unit vector towards the sun, which is not part of the sky."""
+    up: Float[Tensor, "3"]
+    """Unit."""
+    color: Float[Tensor, "3"]
+    """Linear rgb radiance where the pattern of the kind is 1."""
+
+    def radiance(self, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Compute the linear rgb radiance from unit directions; below the horizon it is that of the horizon."""
+        sines = (directions @ self.up).clamp_min(LOWEST_SINE)
+        return _pattern(self.kind, sines, (directions @ self.sun).clamp(-1, 1))[:, None] * self.color
+
+
+def _pattern(kind: tuple[float, ...], sines: Tensor, cosines: Tensor) -> Tensor:
+    """Compute the relative luminance of a clear sky.
+
+    Args:
+        kind: One of `_SKIES`.
+        sines: Sines of heights above the horizon.
+        cosines: Cosines of angles to the sun; both are broadcast.
+    """
+    a, b, c, d, e = kind
+    around = 1 + c * ((d * cosines.acos()).exp() - math.exp(d * math.pi / 2)) + e * cosines.square()
+    return (1 + a * (b / sines).exp()) * around
+
+
+@dataclass(frozen=True, eq=False)
 class SkyEvidence:
     """Brightness that the views show above the horizon, in b cells."""
 
     directions: Float[Tensor, "b 3"]
     """Unit vectors to the middles of the cells, scene's frame."""
-    log_luminance: Float[Tensor, "b"]
-    """Logarithm of linear luminance, median over the pixels."""
+    colors: Float[Tensor, "b 3"]
+    """Linear rgb of the pixel of median luminance."""
     clipped: Bool[Tensor, "b"]
     """Whether the cell is clipped, so that it may be brighter."""
-    sines: Float[Tensor, "b"]
-    """Sines of the cells' heights above the horizon."""
+    up: Float[Tensor, "3"]
+    """Unit up direction of the scene."""
+
+    @property
+    def log_luminance(self) -> Float[Tensor, "b"]:
+        """Logarithm of linear luminance."""
+        return (self.colors @ LUMINANCE).clamp_min(1e-3).log()
+
+    @property
+    def sines(self) -> Float[Tensor, "b"]:
+        """Sines of the cells' heights above the horizon."""
+        return (self.directions @ self.up).clamp_min(LOWEST_SINE)
+
+    @cached_property
+    def suns(self) -> Float[Tensor, "k 3"]:
+        """The `SUNS` above the horizon."""
+        return SUNS[SUNS @ self.up > LOWEST_SINE]
+
+    @cached_property
+    def log_likelihood(self) -> Float[Tensor, "k"]:
+        """Log likelihood of clear skies with each of `suns`, as of `log_likelihoods`."""
+        return self.log_likelihoods(self.suns)
+
+    @property
+    def is_clear(self) -> float:
+        """Probability that the sky is clear."""
+        return min(float((self.log_likelihood.max() - _AS_LIKELY).sigmoid()), _MOST_CLEAR)
 
     @staticmethod
     def of(captured: CapturedScene) -> "SkyEvidence":
@@ -61,14 +123,12 @@ class SkyEvidence:
             cells.append(torch.from_numpy(tree.query(rays[shown].numpy())[1]))
             colors.append(drawn.color[0, ::_EVERY, ::_EVERY][shown].clamp(0, 1))
         cell, color = torch.cat(cells), torch.cat(colors)
-        log_luminance = (linear_from_srgb(color) @ LUMINANCE).clamp_min(1e-3).log()
-        order = log_luminance.argsort()
+        linear = linear_from_srgb(color)
+        order = (linear @ LUMINANCE).argsort()
         order = order[cell[order].argsort(stable=True)]
         counts = cell.unique(return_counts=True)[1]
         middle = order[counts.cumsum(0) - (counts + 1) // 2][counts >= _FEWEST]
-        directions = _CELLS[cell[middle]]
-        sines = (directions @ captured.up).clamp_min(LOWEST_SINE)
-        return SkyEvidence(directions, log_luminance[middle], color[middle].amax(1) > CLIPPED, sines)
+        return SkyEvidence(_CELLS[cell[middle]], linear[middle], color[middle].amax(1) > CLIPPED, captured.up)
 
     def log_likelihoods(self, suns: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
         """Compare clear skies with the sun in k unit directions with brightness that does not depend on direction.
@@ -80,20 +140,33 @@ class SkyEvidence:
         if not len(self.directions):
             return torch.zeros(len(suns))
         cosines = (suns @ self.directions.T).clamp(-1, 1)
-        found = torch.stack([self._under(sky, cosines) for sky in _SKIES]).amax(0)
+        found = torch.stack([self._under(kind, cosines)[0] for kind in _SKIES]).amax(0)
         return (found - self._without_sky()) / _TEMPERATURE
 
-    def _under(self, sky: tuple[float, ...], cosines: Float[Tensor, "k b"]) -> Float[Tensor, "k"]:
-        """Compute the log likelihood of the cells under one type of sky, at its likeliest brightness.
+    def sky_with(self, sun: Float[Tensor, "3"]) -> ClearSky:
+        """Find the likeliest clear sky with the sun in a unit direction."""
+        cosines = (sun @ self.directions.T).clamp(-1, 1)
+        found = [(kind, *self._under(kind, cosines[None])) for kind in _SKIES]
+        kind, _, brightness = max(found, key=lambda one: float(one[1]))
+        off = self.log_luminance - _pattern(kind, self.sines, cosines).log() - brightness
+        is_sky = (~self.clipped & (off.abs() < 2 * _SD)).float()
+        tint = is_sky @ (self.colors / (self.colors @ LUMINANCE).clamp_min(1e-3)[:, None]) / is_sky.sum().clamp_min(1)
+        return ClearSky(kind, sun, self.up, brightness.exp() * tint / (tint @ LUMINANCE).clamp_min(1e-6))
+
+    def _under(
+        self, kind: tuple[float, ...], cosines: Float[Tensor, "k b"]
+    ) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
+        """Compare the cells with one kind of sky.
 
         Args:
-            sky: One of `_SKIES`.
+            kind: One of `_SKIES`.
             cosines: Cosines of the angles between k suns and the cells.
+
+        Returns:
+            The log likelihood at the likeliest brightness, and the logarithm of that brightness.
         """
-        a, b, c, d, e = sky
-        gradation = 1 + a * (b / self.sines).exp()
-        around = 1 + c * ((d * cosines.acos()).exp() - math.exp(d * math.pi / 2)) + e * cosines.square()
-        off = self.log_luminance - self.log_luminance.median() - (gradation * around).log()
+        middle = self.log_luminance.median()
+        off = self.log_luminance - middle - _pattern(kind, self.sines, cosines).log()
         # the likelihood depends on the histogram of these differences alone
         step, count = float(_BRIGHTNESS[1] - _BRIGHTNESS[0]), len(_BRIGHTNESS)
         position = ((off - _BRIGHTNESS[0]) / step).round().long().clamp(0, count - 1)
@@ -106,7 +179,8 @@ class SkyEvidence:
         for which, table in ((~self.clipped, log_density), (self.clipped, log_share_brighter)):
             histogram = position[:, which].flatten().bincount(minlength=len(off) * count).reshape(-1, count)
             total += histogram.float() @ table
-        return total.amax(1)
+        likeliest = total.max(1)
+        return likeliest.values, _SKY_BRIGHTNESS[likeliest.indices] + middle
 
     def _without_sky(self) -> float:
         """Compute the log likelihood of the cells if each is as bright as any other."""
@@ -115,3 +189,9 @@ class SkyEvidence:
         others = (density.sum(1) - density.diagonal()) / max(len(seen) - 1, 1)
         log_density = (_IS_SKY * others + (1 - _IS_SKY) * _ANY).log().sum()
         return float(log_density + self.clipped.sum() * (_IS_SKY * share + (1 - _IS_SKY) * 0.5).log())
+
+
+def clear_sky_evidence(captured: CapturedScene) -> SkyEvidence | None:
+    """Return what the views show above the horizon if that is more likely a clear sky than not."""
+    evidence = SkyEvidence.of(captured)
+    return evidence if evidence.is_clear > 0.5 else None

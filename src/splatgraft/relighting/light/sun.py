@@ -665,19 +665,21 @@ def lit_over_shaded(
     return found.median(0).values.clamp_min(0) if len(found) else None
 
 
-def with_sun(light: Light, sun: Sun) -> Light:
-    """Replace the infinitely distant sources of a light by a sun; the irradiance on the surface stays the same.
+def with_sun(light: Light, sun: Sun, *, is_added: bool = False) -> Light:
+    """Replace the infinitely distant sources of a light by a sun.
 
     Args:
         light: The estimated light.
         sun: The sun at the same place. If its ratio is None, it replaces all sources and gets their strength, or 0.6 of
             all other light if that is more.
+        is_added: Whether all other light is known, so that it stays as it is. Otherwise the irradiance on the surface
+            stays the same.
     """
     kept = () if sun.ratio is None else tuple(one for one in light.sources if math.isfinite(one.distance))
     others = replace(light, sources=kept)
     before, shaded = (one.irradiance(sun.normal[None])[0] for one in (light, others))
     ratio = (before / shaded - 1).clamp_min(_MIN_RATIO_BY_HAND) if sun.ratio is None else sun.ratio
-    scale = float(before @ LUMINANCE) / float((shaded * (1 + ratio)) @ LUMINANCE)
+    scale = 1.0 if is_added else float(before @ LUMINANCE) / float((shaded * (1 + ratio)) @ LUMINANCE)
     dimmed = tuple(replace(s, irradiance=tuple(scale * v for v in s.irradiance)) for s in others.sources)
     irradiance = scale * shaded * ratio / float(sun.direction @ sun.normal)
     x, y, z = sun.direction.tolist()
