@@ -123,8 +123,11 @@ def before_walls(capture, tmp_path) -> PosedImages:
 
 
 @pytest.mark.long
-def test_walls_behind_the_points_are_shown_to_held_out_views_and_dark_ones_have_no_holes(before_walls, monkeypatch):
-    options = ReconstructOptions(iterations=200, budget=1500, sh_degree=0, eval_every=8)
+@pytest.mark.parametrize("quality", ["draft", "standard"])
+def test_walls_behind_the_points_are_shown_to_held_out_views_and_dark_ones_have_no_holes(
+    quality, before_walls, monkeypatch
+):
+    options = ReconstructOptions(quality, iterations=200, budget=1500, sh_degree=0, eval_every=8)
     found = reconstruct(before_walls, options)
     monkeypatch.setattr(SURROUNDINGS, lambda images, background: False)
     without = reconstruct(before_walls, options)

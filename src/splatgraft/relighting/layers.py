@@ -24,6 +24,7 @@ from splatgraft.relighting.shading import (
     KNOWN_LIGHTS,
     KNOWN_SURFACES,
     LEVEL_ERROR_STOPS,
+    SKY_LEVEL_ERROR_STOPS,
     ShadeSettings,
     apply_gain,
     irradiance,
@@ -230,9 +231,12 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
 
 def _light_note(scene: SceneLight) -> Note:
     """Describe the light at the new place, and warn if most of it is a guess."""
+    is_clear = scene.estimate is not None and scene.estimate.sky is not None
+    place = "At the new place, under a clear sky" if is_clear else "At the new place"
     end = "." if scene.estimate is not None else ", as given."
-    text = f"At the new place: {describe_light(scene.light, scene.captured.up)}{end}"
-    certain = light_confidence(scene.light)
+    text = f"{place}: {describe_light(scene.light, scene.captured.up)}{end}"
+    # what no camera saw of a clear sky is no guess
+    certain = light_confidence(replace(scene.light, coverage=1.0) if is_clear else scene.light)
     if certain >= 0.5:
         return Note(text)
     remedy = (
@@ -246,7 +250,8 @@ def _level_notes(scene: SceneLight, objects: Sequence[PreparedObject]) -> tuple[
     """Describe the uncertain level of an estimated light, which meshes show, because their albedo is absolute."""
     if scene.estimate is None or not any(isinstance(one.gaussians, KnownSurface) for one in objects):
         return ()
-    text = f"A mesh is as bright as it should be to a standard error of {LEVEL_ERROR_STOPS:.1f} stops."
+    error = LEVEL_ERROR_STOPS if scene.estimate.sky is None else SKY_LEVEL_ERROR_STOPS
+    text = f"A mesh is as bright as it should be to a standard error of {error:.1f} stops."
     return (Note(text, "said", "Compare it with things of similar colour beside it; exposure corrects it."),)
 
 
@@ -274,7 +279,8 @@ def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Ten
     if source is None:
         return _Shading(received, unknown_origin_ratio(received, opacities), None)
     if isinstance(one.gaussians, KnownSurface):
-        settings = KNOWN_SURFACES if scene.estimate is None else KNOWN_IN_ESTIMATED
+        is_level_known = scene.estimate is None or scene.estimate.sky is not None
+        settings = KNOWN_SURFACES if is_level_known else KNOWN_IN_ESTIMATED
     else:
         settings = KNOWN_LIGHTS if scene.estimate is None and source.estimate is None else ShadeSettings()
     shade = shade_ratio(received, source.irradiance, opacities, settings=settings)

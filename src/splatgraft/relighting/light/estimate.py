@@ -6,6 +6,8 @@
 4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it. Otherwise replace them by the
    sun that is known from the photos' clock or, out of doors, from a clear sky or as the brightest source that no camera
    saw (`known_sun.py`). It moves to the shadows and takes the strength that these show, or else the most probable one.
+   If the views show a clear sky (`sky.py`), the radiance that no camera saw is that of this sky, and the sun is added
+   to it with a clear sky's strength.
 5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
 """
 
