@@ -11,7 +11,7 @@ from torch import Tensor
 from splatgraft.core.cameras import Cameras, look_at, pinhole
 from splatgraft.core.clock_sun import ClockSun, SunCandidate
 from splatgraft.core.directions import even_directions, frames_along
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, KnownSurface
 from splatgraft.core.images import srgb_from_linear
 from splatgraft.core.rotations import quaternion_from_rotation
 from splatgraft.core.spherical_harmonics import dc_from_rgb
@@ -55,6 +55,26 @@ def blobs(
 
 def same_bits(one: Gaussians, other: Gaussians) -> bool:
     return all(torch.equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(Gaussians))
+
+
+def ball(albedo=0.5, *, metallic=0.0, roughness=1.0, emission=0.0, count=1500) -> KnownSurface:
+    """Return a ball of radius 0.3 as sampled from a mesh."""
+    around = even_directions(count)
+    # flat discs of .65 spacings
+    flat = surfels(
+        0.3 * around,
+        around,
+        width=0.65 * 0.3 * math.sqrt(4 * math.pi / count),
+        srgb=float(srgb_from_linear(torch.tensor(albedo))),
+    )
+    full = torch.full((count,), 1.0)
+    return KnownSurface(
+        **vars(flat),
+        normals=around,
+        metallic=metallic * full,
+        roughness=roughness * full,
+        emission=emission * torch.ones(count, 3),
+    )
 
 
 def ring(

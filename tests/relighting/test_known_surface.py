@@ -4,12 +4,12 @@ import math
 
 import pytest
 import torch
-from shapes import ring, surfels
+from shapes import ball, ring, surfels
 
 from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions
-from splatgraft.core.gaussians import Gaussians, KnownSurface
-from splatgraft.core.images import linear_from_srgb, srgb_from_linear
+from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.images import linear_from_srgb
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import colors
 from splatgraft.relighting import Light, LightSource, RelightOptions, Relit, SourceScene, relight
@@ -20,24 +20,6 @@ from splatgraft.relighting.transfer import TransferValues
 WHOLE = RelightOptions(most_added=0.0, fitted_views=0)
 SUN = (0.36, 0.48, 0.8)
 QUARTER = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-def ball(albedo=0.5, *, metallic=0.0, roughness=1.0, emission=0.0, count=1500) -> KnownSurface:
-    around = even_directions(count)
-    # as sampled from a mesh: flat discs of .65 spacings
-    flat = surfels(0.3 * around, around, width=0.65 * 0.3 * math.sqrt(4 * math.pi / count), srgb=float(_srgb(albedo)))
-    full = torch.full((count,), 1.0)
-    return KnownSurface(
-        **vars(flat),
-        normals=around,
-        metallic=metallic * full,
-        roughness=roughness * full,
-        emission=emission * torch.ones(count, 3),
-    )
-
-
-def _srgb(value: float) -> torch.Tensor:
-    return srgb_from_linear(torch.tensor(value))
 
 
 def floor() -> Gaussians:

@@ -5,16 +5,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from shapes import UP, clock_at, ring, sunlit_scene, surfels
+from shapes import UP, ball, clock_at, ring, sunlit_scene, surfels
 from torch import Tensor
 
-from splatgraft.core.bounds import BoundingSphere
+from splatgraft.compositing.composite import Composite, PlacedObject
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
+from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
+from splatgraft.relighting import relight
 from splatgraft.relighting.captured_scene import CapturedScene
-from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.known_sun import BY_CLOCK, known_sun
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.sky import SkyEvidence, clear_sky_evidence
@@ -160,8 +161,16 @@ def test_under_a_clear_sky_the_level_of_the_light_does_not_depend_on_the_colour_
     found = []
     for albedo in (0.05, 0.3):
         scene, irradiance = garden(albedo, 8.0)
-        light = estimate_light(scene, BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 0.3))
-        assert isinstance(light, EstimatedLight)
-        found.append(float((light.light.irradiance(UP[None])[0] @ LUMINANCE / irradiance).log2()))
-    assert max(map(abs, found)) < 0.8  # stops; the edges of the shadows show a third or less of the sun's strength
+        none = torch.zeros(scene.gaussians.count, dtype=torch.bool)
+        placed = PlacedObject(ball(0.5), Similarity(1.0, torch.eye(3), torch.tensor([0.0, 0.0, 0.3])))
+        relit = relight(Composite(scene.gaussians, (placed,), none), scene.cameras)
+        assert relit.light is not None
+        found.append(float((relit.light.irradiance(UP[None])[0] @ LUMINANCE / irradiance).log2()))
+        # a mesh takes the level in full
+        on_top = relit.shade[relit.is_object][(ball().normals @ UP) > 0.95] @ LUMINANCE
+        white = relit.light.irradiance(UP[None])[0] @ LUMINANCE / math.pi
+        assert float(on_top.median() / white) == pytest.approx(1, abs=0.2)
+        assert "under a clear sky" in relit.report[0].text
+        assert any("0.3 stops" in note.text for note in relit.report)
+    assert max(map(abs, found)) < 0.8  # stops; the edges of the shadows show half of the sun's strength or less
     assert abs(found[0] - found[1]) < 0.4
