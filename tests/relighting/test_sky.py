@@ -157,6 +157,13 @@ def test_the_strip_of_a_clear_sky_that_the_views_show_tells_how_bright_the_whole
     assert float((found / true).log2().abs().max()) < 0.5  # stops
 
 
+def test_a_sky_that_is_clipped_everywhere_is_white():
+    directions = even_directions(12000)
+    sky = SkyEvidence.of(captured(torch.full((len(directions),), 1.0), directions)).sky_with(SUN)
+    assert float(sky.color.min()) > 0.1
+    assert torch.allclose(sky.color, sky.color[:1].expand(3))
+
+
 def test_under_a_clear_sky_the_level_of_the_light_does_not_depend_on_the_colour_of_the_ground():
     found = []
     for albedo in (0.05, 0.3):

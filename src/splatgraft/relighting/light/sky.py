@@ -150,8 +150,9 @@ class SkyEvidence:
         kind, _, brightness = max(found, key=lambda one: float(one[1]))
         off = self.log_luminance - _pattern(kind, self.sines, cosines).log() - brightness
         is_sky = (~self.clipped & (off.abs() < 2 * _SD)).float()
-        tint = is_sky @ (self.colors / (self.colors @ LUMINANCE).clamp_min(1e-3)[:, None]) / is_sky.sum().clamp_min(1)
-        return ClearSky(kind, sun, self.up, brightness.exp() * tint / (tint @ LUMINANCE).clamp_min(1e-6))
+        # the colour of one more cell is white, for a sky that is clipped everywhere
+        tint = 1 + is_sky @ (self.colors / (self.colors @ LUMINANCE).clamp_min(1e-3)[:, None])
+        return ClearSky(kind, sun, self.up, brightness.exp() * tint / (tint @ LUMINANCE))
 
     def _under(
         self, kind: tuple[float, ...], cosines: Float[Tensor, "k b"]
