@@ -138,6 +138,11 @@ def test_the_sun_is_known_by_the_clock_then_by_the_sky_then_by_the_brightest_sou
     assert known is not None
     assert known.name == BY_CLOCK
     assert float(known.directions[known.log_density.argmax()] @ by_clock) > math.cos(math.radians(4))
+    # a clear sky makes a weak sun less probable, with a clock and without one
+    for scene in (clear, CapturedScene(clear.gaussians, clear.cameras, clock_at(SUN))):
+        shown = clear_sky_evidence(scene)
+        assert shown is not None
+        assert shown.is_clear > 0.5  # without a sky
 
 
 @pytest.mark.parametrize("turbidity", [2.0, 4.0])

@@ -50,7 +50,7 @@ estimate."""
 LEVEL_ERROR_STOPS = 0.65
 """Standard error of a level that is drawn so, of places left out of that regression."""
 SKY_LEVEL_ERROR_STOPS = 0.3
-"""Standard error of a level by a clear sky."""
+"""Standard error of a level by a clear sky; set by hand. Six scenes of three exams have .14 (benchmarks/LOG.md)."""
 
 
 def soft_cosine(cosine: Float[Tensor, "n k"], softness: Float[Tensor, "k"]) -> Float[Tensor, "n k"]:

@@ -73,8 +73,8 @@ class EstimatedLight:
     mean: Light
     """Mean over the posterior."""
     sun: Sun | None
-    """Sun that replaces the distant sources of `mean`, from shadows, the clock or, out of doors, shading; None without
-    one."""
+    """Sun that replaces the distant sources of `mean`, from shadows, the clock or, outdoors, a clear sky or shading;
+    None without one."""
     hidden: RadianceEstimate
     """Radiance that no camera recorded."""
     sky: ClearSky | None

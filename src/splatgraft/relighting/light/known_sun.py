@@ -24,7 +24,7 @@ from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import DIRECTIONS
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceProblem
-from splatgraft.relighting.light.sky import SUNS, SkyEvidence
+from splatgraft.relighting.light.sky import SkyEvidence, suns_above
 from splatgraft.relighting.light.sun import ERROR_DEG, LOWEST_SINE, Sun, prior_near
 
 # a clear sky, fitted by benchmarks/fit_sky.py
@@ -80,7 +80,7 @@ def known_sun(
         outdoors: Whether the scene is out of doors.
         is_unseen: Whether no camera saw `main`, so that it may be the sun.
     """
-    above = SUNS[SUNS @ captured.up > LOWEST_SINE]
+    above = suns_above(captured.up)
     by_sky = torch.zeros(len(above)) if sky is None else sky.log_likelihood
     by_clock = direction_by_clock(captured.clock, main)
     if by_clock is not None:

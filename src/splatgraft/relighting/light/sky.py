@@ -20,8 +20,7 @@ from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.panorama import CLIPPED
 from splatgraft.relighting.light.sun import LOWEST_SINE
 
-SUNS = even_directions(6400)
-"""Directions in which the sun may stand, 2.5 degrees apart."""
+_SUNS = even_directions(6400)  # directions in which the sun may stand, 2.5 degrees apart
 _SKIES = (  # CIE S 011: a and b of the gradation from zenith to horizon, c, d and e of the indicatrix around the sun
     (-1.0, -0.55, 10.0, -3.0, 0.45),
     (-1.0, -0.32, 10.0, -3.0, 0.45),
@@ -41,6 +40,11 @@ _MOST_CLEAR = 0.9  # maximum probability of a clear sky
 _TEMPERATURE = 8.0  # divisor of log likelihoods, because neighbouring cells share their errors
 _BRIGHTNESS = torch.arange(-5.0, 5.0, 0.1)  # bins of the logarithm of a cell's luminance over that of the model
 _SKY_BRIGHTNESS = _BRIGHTNESS[20:-20:2]  # brightnesses of the whole sky that are tried, in the same unit
+
+
+def suns_above(up: Float[Tensor, "3"]) -> Float[Tensor, "k 3"]:
+    """Return the unit directions above the horizon in which the sun may stand, 2.5 degrees apart."""
+    return _SUNS[_SUNS @ up > LOWEST_SINE]
 
 
 @dataclass(frozen=True)
@@ -99,14 +103,9 @@ class SkyEvidence:
         return (self.directions @ self.up).clamp_min(LOWEST_SINE)
 
     @cached_property
-    def suns(self) -> Float[Tensor, "k 3"]:
-        """The `SUNS` above the horizon."""
-        return SUNS[SUNS @ self.up > LOWEST_SINE]
-
-    @cached_property
     def log_likelihood(self) -> Float[Tensor, "k"]:
-        """Log likelihood of clear skies with each of `suns`, as of `log_likelihoods`."""
-        return self.log_likelihoods(self.suns)
+        """Log likelihood of clear skies with each of the k `suns_above`, as of `log_likelihoods`."""
+        return self.log_likelihoods(suns_above(self.up))
 
     @property
     def is_clear(self) -> float:
