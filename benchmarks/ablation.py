@@ -550,6 +550,11 @@ ROWS: Mapping[str, Row] = {
         "the light of a clear sky from the sky that is seen; only the sun's direction",
         {"relighting.light.sky.SkyEvidence.sky_with": lambda evidence, sun: None},
     ),
+    "sun-unseen-shade": Row(
+        "sun",
+        "no sun in the shade of things that were not captured",
+        {"relighting.light.unseen_shade.OpenGround.is_shaded": lambda ground, place: False},
+    ),
     "sun-strength": Row(
         "sun",
         "the sun's strength from shadow edges; that of the sources",
@@ -573,7 +578,7 @@ ROWS: Mapping[str, Row] = {
     "sun-colors": Row(
         "sun",
         "the sun's texels compared in one colour alone",
-        {"relighting.light.sun._MAX_GREEN": _MANY, "relighting.light.sun._MAX_RED": _MANY},
+        {"relighting.light.sun.MAX_GREEN": _MANY, "relighting.light.sun._MAX_RED": _MANY},
     ),
 }
 """Rows by name: the first stage that is changed, what is switched off, and how."""

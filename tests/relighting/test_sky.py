@@ -9,6 +9,7 @@ from shapes import UP, ball, clock_at, ring, sunlit_scene, surfels
 from torch import Tensor
 
 from splatgraft.compositing.composite import Composite, PlacedObject
+from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.directions import even_directions
 from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
@@ -16,6 +17,7 @@ from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.relighting import relight
 from splatgraft.relighting.captured_scene import CapturedScene
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.known_sun import BY_CLOCK, known_sun
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.sky import SkyEvidence, clear_sky_evidence
@@ -47,10 +49,13 @@ def captured(luminance: Tensor, directions: Tensor, *, tint: Tensor = GRAY) -> C
     return CapturedScene(dome(luminance, directions, tint=tint), ring(height=1.0, radius=2.0, focal=50.0))
 
 
-def garden(albedo: float, strength: float) -> tuple[CapturedScene, Tensor]:
+def garden(
+    albedo: float, strength: float, *, tint: Tensor = GRAY, shade: Tensor | None = None
+) -> tuple[CapturedScene, Tensor]:
     """A hedge around balls on a floor, under a clear sky and a sun; returns the irradiance on level ground, too.
 
-    `strength` is the sun's irradiance on level ground over the sky's.
+    `strength` is the sun's irradiance on level ground over the sky's, and `tint` its colour. Something unseen shades
+    the floor around `shade`.
     """
     directions = even_directions(12000)
     above = directions[:, 2] > 0
@@ -58,6 +63,9 @@ def garden(albedo: float, strength: float) -> tuple[CapturedScene, Tensor]:
     sky = (luminance * directions[:, 2])[above].sum() * 4 * math.pi / len(directions)
     near = sunlit_scene(SUN, strength / float(SUN[2]))
     lit = linear_from_srgb(rgb_from_dc(near.sh[:, 0])) / 0.15  # over the light of the sky
+    lit = 1 + (lit - 1) * tint
+    if shade is not None:
+        lit[(near.means - shade).norm(dim=1) < 0.8] = 1
     colors = srgb_from_linear((albedo * sky / math.pi * lit).clamp(0, 1))
     near = replace(near, sh=dc_from_rgb(colors)[:, None])
     turn, height = torch.meshgrid(torch.arange(90) / 90 * 2 * math.pi, torch.linspace(0, 1.2, 5), indexing="ij")
@@ -186,3 +194,20 @@ def test_under_a_clear_sky_the_level_of_the_light_does_not_depend_on_the_colour_
         assert any("0.3 stops" in note.text for note in relit.report)
     assert max(map(abs, found)) < 0.8  # stops; the edges of the shadows show half of the sun's strength or less
     assert abs(found[0] - found[1]) < 0.4
+
+
+def test_in_the_shade_of_something_unseen_the_sky_is_the_only_light():
+    shaded = BoundingSphere(torch.tensor([1.4, 1.4, 0.3]), 0.3)
+    scene, irradiance = garden(0.3, 8.0, tint=torch.tensor([1.3, 1.0, 0.55]), shade=shaded.center)
+    found = estimate_light(scene, shaded)
+    assert isinstance(found, EstimatedLight)
+    assert found.is_shaded
+    assert found.sun is None
+    light = found.light.irradiance(UP[None])[0] @ LUMINANCE
+    assert abs(float((light / (irradiance / 9)).log2())) < 0.5  # stops
+    assert not any(math.isinf(source.distance) for source in found.light.sources)
+    # the same estimate has the sun where the ground is sunlit
+    moved = found.at(scene, replace(shaded, center=torch.tensor([1.4, -1.8, 0.3])))
+    assert isinstance(moved, EstimatedLight)
+    assert moved.sun is not None
+    assert float(moved.light.irradiance(UP[None])[0] @ LUMINANCE) > 4 * float(light)

@@ -7,7 +7,8 @@
    sun that is known from the photos' clock or, out of doors, from a clear sky or as the brightest source that no camera
    saw (`known_sun.py`). It moves to the shadows and takes the strength that these show, or else the most probable one.
    If the views show a clear sky (`sky.py`), the radiance that no camera saw is that of this sky, and the sun is added
-   to it with a clear sky's strength.
+   to it with a clear sky's strength. In the shade of something that was not captured (`unseen_shade.py`) there is no
+   sun, and all other light stays.
 5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
 """
 
@@ -41,7 +42,17 @@ from splatgraft.relighting.light.panorama import (
 from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
 from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
 from splatgraft.relighting.light.sky import ClearSky, clear_sky_evidence
-from splatgraft.relighting.light.sun import UNSEEN_RADIUS_DEG, Point, Sun, find_sun, set_sun, sun_near, with_sun
+from splatgraft.relighting.light.sun import (
+    UNSEEN_RADIUS_DEG,
+    Point,
+    Sun,
+    find_sun,
+    set_sun,
+    sun_near,
+    with_sun,
+    without_sun,
+)
+from splatgraft.relighting.light.unseen_shade import OpenGround
 from splatgraft.rendering import render
 
 # the evidence; set by hand
@@ -72,9 +83,12 @@ class EstimatedLight:
 
     mean: Light
     """Mean over the posterior."""
-    sun: Sun | None
+    found_sun: Sun | None
     """Sun that replaces the distant sources of `mean`, from shadows, the clock or, outdoors, a clear sky or shading;
     None without one."""
+    ground: OpenGround | None
+    """Ground that shows where something that was not captured hides `found_sun`; None without one, for one that was
+    set by hand, and in a room."""
     hidden: RadianceEstimate
     """Radiance that no camera recorded."""
     sky: ClearSky | None
@@ -85,9 +99,23 @@ class EstimatedLight:
     """Place at which the sources were estimated."""
 
     @property
+    def is_shaded(self) -> bool:
+        """Whether something that was not captured shades the place from `found_sun`."""
+        return self.ground is not None and self.ground.is_shaded(self.place)
+
+    @property
+    def sun(self) -> Sun | None:
+        """The sun that shines on the place."""
+        return None if self.is_shaded else self.found_sun
+
+    @property
     def light(self) -> Light:
         """The estimate, including the sun."""
-        return self.mean if self.sun is None else with_sun(self.mean, self.sun, is_added=self.sky is not None)
+        if self.found_sun is None:
+            return self.mean
+        if self.is_shaded:
+            return without_sun(self.mean, self.found_sun, is_added=self.sky is not None)
+        return with_sun(self.mean, self.found_sun, is_added=self.sky is not None)
 
     def rest(self) -> Float[Tensor, "k 3"]:
         """Return the linear rgb radiance of all `DIRECTIONS` without the sources, to which ambient light is fitted."""
@@ -101,8 +129,9 @@ class EstimatedLight:
         named = replace(sun, name=sun.name or ("lamp" if math.isfinite(sun.distance) else self._name_at(sun.direction)))
         if self.sky is not None and sun.ratio is None:
             named = replace(named, ratio=clear_ratio(float(sun.direction @ self.sky.up)))
-        placed = with_blocker_distances(replace(self, sun=named).light, scene, self.place)
-        return replace(self, sun=replace(named, blockers_within=placed.sources[0].blockers_within))
+        lit = with_sun(self.mean, named, is_added=self.sky is not None)
+        blockers_within = with_blocker_distances(lit, scene, self.place).sources[0].blockers_within
+        return replace(self, found_sun=replace(named, blockers_within=blockers_within))
 
     def _name_at(self, direction: Float[Tensor, "3"]) -> str:
         """Name a source found from shadows by a photographed one within 20 degrees, or by its possible kinds."""
@@ -121,7 +150,7 @@ class EstimatedLight:
         evidence = replace(self.evidence, around=place_surroundings(scene, captured.cameras, place))
         _, rest = _split_peaks(self.hidden.radiance(evidence), evidence, within=math.inf)
         mean = replace(self.mean, ambient=_ambient_of(rest), **_seen_shares(evidence))
-        return replace(self, evidence=evidence, mean=mean)
+        return replace(self, evidence=evidence, mean=mean, place=place)
 
 
 def estimate_light(
@@ -177,7 +206,8 @@ def estimate_light(
     if known is not None and sun is not None and sun.ratio is None:
         sun = sun_towards(sun, sky, problem, evidence, rest)
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
-    found = EstimatedLight(mean, None, hidden, clear, evidence, place)
+    ground = None if sun is None or sun_through or not outdoors else OpenGround.around(whole, region, sun)
+    found = EstimatedLight(mean, None, ground, hidden, clear, evidence, place)
     return found if sun is None else found.with_sun(sun, scene)
 
 

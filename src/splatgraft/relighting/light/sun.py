@@ -8,14 +8,11 @@
 3. Compare differences of log luminance between texels a few texels apart in the picture with the differences that sun
    and other light predict. The density of a difference is a Cauchy density, because texels also differ by material. It
    is mixed with the chance that something unseen shades a texel, or a whole tile of the picture.
-4. Add the log density of the direction by the clock of the photos, if there is one: where the sun must be is known, so
-   that fainter shadows show it.
-5. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
-6. Compare the sun with lamps at a few heights, whose shadows diverge.
-7. If no direction is decisively better than no sun, do the same in a wider region.
+4. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
+5. Compare the sun with lamps at a few heights, whose shadows diverge.
+6. If no direction is decisively better than no sun, do the same in a wider region.
 
-If no shadow is decisive, but shading or the clock of the photos shows a sun, `sun_near` moves it to the shadows of
-several surfaces.
+Where a sun is known to exist, `sun_near` moves it to the shadows of several surfaces.
 
 `set_sun` searches in the same way near the direction of points that a user marks together with their shadows.
 """
@@ -32,7 +29,6 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
-from splatgraft.core.clock_sun import ClockSun, clock_directions
 from splatgraft.core.directions import even_directions, frames_along, tangents, vogel_offsets
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import LUMINANCE, linear_from_srgb
@@ -50,7 +46,7 @@ _WHITE, _BLACK = 0.93, 0.01  # linear; brighter channels may be clipped, darker 
 
 # differences between texels; set by hand
 _COARSE, _FINE, _ACROSS = 6, 3, 14  # texels between compared texels: search, refinement, ratio of lit to shaded
-_MAX_GREEN, _MAX_RED = 0.15, 1.2
+MAX_GREEN, _MAX_RED = 0.15, 1.2
 """Largest differences of log(green / sqrt(red blue)) and of log(red / blue) within one material. The second is larger
 because sun and sky differ along it."""
 _NOISE = 0.12  # scale of differences of log luminance within a material
@@ -70,12 +66,11 @@ _FINE_STEPS_DEG = (1.0, 0.33)  # of the grids around a maximum, three on each si
 _LAMP_HEIGHTS, _LAMP_SPAN_DEG = (4.0, 2.0), 10.0  # half widths of the surface; search around the sun's direction
 _PROMISING = 10.0  # log likelihood over that of even light above which a direction of the search is refined
 _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
-_SURFACES = 2  # level surfaces whose shadows move a sun: a table, and the ground around it
+SURFACES = 2  # level surfaces whose shadows move a sun: a table, and the ground around it
 _STEP_DEG = 2.5  # of the grids of directions around a given one
 _IMPROBABLE = 4.5  # difference of log densities to the most probable direction, as at 3 standard errors
 _WIDER = 3.0  # radius of the second region: few things stand near a small object, but the sun is the same
 _TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a prior, because texels share their errors
-_CLOCK_IS_WRONG = 0.05  # probability that no candidate of the clock is the sun
 _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
 _MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
 _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12  # angular radii that are tried, and directions that sample each
@@ -94,6 +89,10 @@ Point = tuple[float, float, float]
 
 LogPrior = Callable[[Float[Tensor, "k 3"]], Float[Tensor, "k"]]
 """Log density of k unit directions of the sun."""
+
+
+def _even(directions: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
+    return torch.zeros(len(directions))
 
 
 @dataclass(frozen=True)
@@ -281,7 +280,7 @@ class _Comparison:
         log_rgb, valid = picture.log_rgb[::every, ::every], picture.valid[::every, ::every]
         log_luminance = (log_rgb.exp() @ LUMINANCE).log()
         red, green, blue = log_rgb.unbind(-1)
-        chroma = torch.stack([(green - 0.5 * (red + blue)) / _MAX_GREEN, (red - blue) / _MAX_RED], -1)
+        chroma = torch.stack([(green - 0.5 * (red + blue)) / MAX_GREEN, (red - blue) / _MAX_RED], -1)
         tile = torch.arange(0, _SIZE, every) * _TILES // _SIZE
         tile = tile[:, None] * _TILES + tile
         skip, gap = step // every, apart // every
@@ -380,7 +379,7 @@ class _ShadowEvidence:
         visible = (self.surface.shadows(self.standing, part, every) for part in directions.split(64))  # bounds memory
         return torch.cat([coarse.of_suns(one, ambient, _FEW_STRENGTHS) for one in visible])
 
-    def best(self, directions: Float[Tensor, "k 3"], log_prior: LogPrior) -> tuple[Float[Tensor, "3"], float, float]:
+    def best(self, directions: Float[Tensor, "k 3"], log_prior: LogPrior = _even) -> tuple[Float[Tensor, "3"], float]:
         """Find the sun's most probable direction.
 
         Args:
@@ -388,8 +387,7 @@ class _ShadowEvidence:
             log_prior: Log density of directions.
 
         Returns:
-            The direction; the log likelihood of its shadows over that of no sun, -inf if no direction is promising; and
-            this plus the log prior times `_TEMPERATURE`.
+            The direction, and the log likelihood of its shadows over that of no sun, -inf if none is promising.
         """
         fine, surface = _Comparison.of(self.picture, _FINE), self.surface
         blurred_ambient = _blurred(self.ambient[None])
@@ -410,27 +408,24 @@ class _ShadowEvidence:
                 mode = near[i]
                 if float(posterior[i]) > likeliest:
                     best, likeliest, evidence = mode, float(posterior[i]), float(found[i])
-        return best, evidence, likeliest
+        return best, evidence
 
 
 def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float = _DECISIVE) -> Sun | None:
     """Find the sun, or the lamp, whose shadows a level surface shows, in the region or else in a wider one.
 
-    Without a clock, the wider region is at most as large as the cameras' distance. So it is left out if the object
-    fills the views.
+    The wider region is at most as large as the cameras' distance. So it is left out if the object fills the views.
 
     Args:
         captured: The scene with all objects that cast shadows during the capture.
         region: Sphere around the place that contains the surface and the occluders on it.
-        decisive: Minimum log likelihood over that of no sun; the clock's prior counts if the shadows agree with it.
+        decisive: Minimum log likelihood over that of no sun.
 
     Returns:
         The sun; None if no direction is decisively better than no sun.
     """
-    wider = _WIDER * region.radius
-    if captured.clock is None:
-        distance = float((captured.cameras.centers - region.center).norm(dim=1).median())
-        wider = max(region.radius, min(wider, distance))
+    distance = float((captured.cameras.centers - region.center).norm(dim=1).median())
+    wider = max(region.radius, min(_WIDER * region.radius, distance))
     radii = dict.fromkeys((region.radius, wider))
     found = (_find_sun_within(captured, replace(region, radius=radius), decisive) for radius in radii)
     return next((sun for sun in found if sun is not None), None)
@@ -440,8 +435,8 @@ def _find_sun_within(captured: CapturedScene, region: BoundingSphere, decisive: 
     shown = _ShadowEvidence.of(captured, region)
     if shown is None:
         return None
-    direction, evidence, posterior = shown.best(shown.above(_DIRECTIONS), _prior_by_clock(captured.clock))
-    if evidence < _PROMISING or posterior < decisive:
+    direction, evidence = shown.best(shown.above(_DIRECTIONS))
+    if evidence < decisive:
         return None
     sun = _measured(shown, direction, evidence)
     lamp = None if sun is None else _lamp_near(sun, shown)
@@ -470,7 +465,7 @@ def _lamp_near(sun: Sun, shown: _ShadowEvidence) -> Sun | None:
     likelihood, height, lamp = max(found, key=itemgetter(0))
     if likelihood < least:
         return None
-    direction, evidence, _ = lamp.best(near, _prior_by_clock(None))
+    direction, evidence = lamp.best(near)
     measured = _measured(lamp, direction, evidence) if evidence > sun.evidence else None
     return None if measured is None else replace(measured, distance=height / float(direction @ measured.normal))
 
@@ -498,7 +493,7 @@ def sun_near(
         The sun in the mean direction, with the standard error of that. Its ratio is None if no surface clearly shows
         its shadow.
     """
-    surfaces = _ShadowEvidence.on_surfaces(captured, replace(region, radius=_WIDER * region.radius), most=_SURFACES)
+    surfaces = _ShadowEvidence.on_surfaces(captured, replace(region, radius=_WIDER * region.radius), most=SURFACES)
     probable = log_density > -math.inf
     for one in surfaces:
         probable &= directions @ one.surface.plane.normal > LOWEST_SINE
@@ -516,14 +511,6 @@ def sun_near(
         return moved
     measured = _measured(shown, mean, evidence)
     return moved if measured is None else replace(measured, error_deg=error_deg, name=name)
-
-
-def _prior_by_clock(clock: ClockSun | None) -> LogPrior:
-    """Return the log density by the clock's candidates, which may all be wrong; uniform without a clock."""
-    towards = clock_directions(clock)
-    if clock is None or not len(towards):
-        return lambda directions: torch.zeros(len(directions))
-    return prior_near(towards, max(clock.error_deg, ERROR_DEG), wrong=_CLOCK_IS_WRONG)
 
 
 def prior_near(towards: Float[Tensor, "c 3"], error_deg: float, *, wrong: float = 0.0) -> LogPrior:
@@ -565,7 +552,7 @@ def set_sun(points: Sequence[Point], captured: CapturedScene) -> Sun:
         near = torch.zeros(0, 3) if shown is None else shown.above(_around(direction, 2 * _BY_HAND_DEG, _STEP_DEG))
         if shown is None or not len(near):
             continue
-        found, evidence, _ = shown.best(near, prior_near(direction[None], _BY_HAND_DEG))
+        found, evidence = shown.best(near, prior_near(direction[None], _BY_HAND_DEG))
         measured = _measured(shown, found, math.inf) if evidence > _PROMISING else None
         if measured is not None:
             return replace(measured, name=SET_BY_HAND)
@@ -675,12 +662,10 @@ def with_sun(light: Light, sun: Sun, *, is_added: bool = False) -> Light:
         is_added: Whether all other light is known, so that it stays as it is. Otherwise the irradiance on the surface
             stays the same.
     """
-    kept = () if sun.ratio is None else tuple(one for one in light.sources if math.isfinite(one.distance))
-    others = replace(light, sources=kept)
+    others = replace(light, sources=()) if sun.ratio is None else _without_distant_sources(light)
     before, shaded = (one.irradiance(sun.normal[None])[0] for one in (light, others))
     ratio = (before / shaded - 1).clamp_min(_MIN_RATIO_BY_HAND) if sun.ratio is None else sun.ratio
     scale = 1.0 if is_added else float(before @ LUMINANCE) / float((shaded * (1 + ratio)) @ LUMINANCE)
-    dimmed = tuple(replace(s, irradiance=tuple(scale * v for v in s.irradiance)) for s in others.sources)
     irradiance = scale * shaded * ratio / float(sun.direction @ sun.normal)
     x, y, z = sun.direction.tolist()
     r, g, b = irradiance.tolist()
@@ -693,4 +678,21 @@ def with_sun(light: Light, sun: Sun, *, is_added: bool = False) -> Light:
         blockers_within=sun.blockers_within,
         distance=sun.distance,
     )
-    return replace(others, sources=(found, *dimmed), ambient=scale * others.ambient)
+    dimmed = _scaled(others, scale)
+    return replace(dimmed, sources=(found, *dimmed.sources))
+
+
+def without_sun(light: Light, sun: Sun, *, is_added: bool = False) -> Light:
+    """Make the light in the shade of a sun: remove the infinitely distant sources of a light, as `with_sun` does."""
+    others = _without_distant_sources(light)
+    before, shaded = (one.irradiance(sun.normal[None])[0] @ LUMINANCE for one in (light, others))
+    return others if is_added else _scaled(others, float(before / shaded))
+
+
+def _without_distant_sources(light: Light) -> Light:
+    return replace(light, sources=tuple(one for one in light.sources if math.isfinite(one.distance)))
+
+
+def _scaled(light: Light, scale: float) -> Light:
+    sources = tuple(replace(s, irradiance=tuple(scale * v for v in s.irradiance)) for s in light.sources)
+    return replace(light, sources=sources, ambient=scale * light.ambient)
