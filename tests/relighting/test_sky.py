@@ -178,20 +178,25 @@ def test_a_sky_that_is_clipped_everywhere_is_white():
 
 
 def test_under_a_clear_sky_the_level_of_the_light_does_not_depend_on_the_colour_of_the_ground():
-    found = []
-    for albedo in (0.05, 0.3):
-        scene, irradiance = garden(albedo, 8.0)
-        none = torch.zeros(scene.gaussians.count, dtype=torch.bool)
-        placed = PlacedObject(ball(0.5), Similarity(1.0, torch.eye(3), torch.tensor([0.0, 0.0, 0.3])))
-        relit = relight(Composite(scene.gaussians, (placed,), none), scene.cameras)
-        assert relit.light is not None
-        found.append(float((relit.light.irradiance(UP[None])[0] @ LUMINANCE / irradiance).log2()))
-        # a mesh takes the level in full
-        on_top = relit.shade[relit.is_object][(ball().normals @ UP) > 0.95] @ LUMINANCE
-        white = relit.light.irradiance(UP[None])[0] @ LUMINANCE / math.pi
-        assert float(on_top.median() / white) == pytest.approx(1, abs=0.2)
-        assert "under a clear sky" in relit.report[0].text
-        assert any("0.3 stops" in note.text for note in relit.report)
+    place = torch.tensor([0.0, 0.0, 0.3])
+    scene, irradiance = garden(0.05, 8.0)
+    none = torch.zeros(scene.gaussians.count, dtype=torch.bool)
+    relit = relight(
+        Composite(scene.gaussians, (PlacedObject(ball(0.5), Similarity(1.0, torch.eye(3), place)),), none),
+        scene.cameras,
+    )
+    assert relit.light is not None
+    # a mesh takes the level in full
+    on_top = relit.shade[relit.is_object][(ball().normals @ UP) > 0.95] @ LUMINANCE
+    white = relit.light.irradiance(UP[None])[0] @ LUMINANCE / math.pi
+    assert float(on_top.median() / white) == pytest.approx(1, abs=0.2)
+    assert "under a clear sky" in relit.report[0].text
+    assert any("0.3 stops" in note.text for note in relit.report)
+    brighter, more = garden(0.3, 8.0)
+    other = estimate_light(brighter, BoundingSphere(place, 0.3))
+    assert isinstance(other, EstimatedLight)
+    lights = ((relit.light, irradiance), (other.light, more))
+    found = [float((light.irradiance(UP[None])[0] @ LUMINANCE / true).log2()) for light, true in lights]
     assert max(map(abs, found)) < 0.8  # stops; the edges of the shadows show half of the sun's strength or less
     assert abs(found[0] - found[1]) < 0.4
 
