@@ -15,12 +15,13 @@ from splatgraft.core.gaussians import Gaussians, concatenate
 from splatgraft.core.images import LUMINANCE, linear_from_srgb, srgb_from_linear
 from splatgraft.core.similarity import Similarity
 from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
-from splatgraft.relighting import relight
+from splatgraft.relighting import RelightOptions, relight
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.known_sun import BY_CLOCK, known_sun
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.sky import SkyEvidence, clear_sky_evidence
+from splatgraft.relighting.scene_light import SceneLight, find_scene_light
 
 SUN = torch.tensor([math.cos(math.radians(40)), 0.0, math.sin(math.radians(40))])
 ABOVE = even_directions(1600)[even_directions(1600)[:, 2] > 0.05]
@@ -204,15 +205,20 @@ def test_under_a_clear_sky_the_level_of_the_light_does_not_depend_on_the_colour_
 def test_in_the_shade_of_something_unseen_the_sky_is_the_only_light():
     shaded = BoundingSphere(torch.tensor([1.4, 1.4, 0.3]), 0.3)
     scene, irradiance = garden(0.3, 8.0, tint=torch.tensor([1.3, 1.0, 0.55]), shade=shaded.center)
-    found = estimate_light(scene, shaded)
-    assert isinstance(found, EstimatedLight)
+    there = find_scene_light(scene, [shaded], light=None, reach=RelightOptions().reach)
+    assert isinstance(there, SceneLight)
+    found = there.estimate
+    assert found is not None
     assert found.is_shaded
     assert found.sun is None
     light = found.light.irradiance(UP[None])[0] @ LUMINANCE
     assert abs(float((light / (irradiance / 9)).log2())) < 0.5  # stops
     assert not any(math.isinf(source.distance) for source in found.light.sources)
-    # the same estimate has the sun where the ground is sunlit
-    moved = found.at(scene, replace(shaded, center=torch.tensor([1.4, -1.8, 0.3])))
+    # where the ground is sunlit, the same estimate has the sun, for which the shadow maps of the shade do not hold
+    sunlit = replace(shaded, center=torch.tensor([1.4, 0.3, 0.3]))
+    moved = found.at(scene, sunlit)
     assert isinstance(moved, EstimatedLight)
     assert moved.sun is not None
     assert float(moved.light.irradiance(UP[None])[0] @ LUMINANCE) > 4 * float(light)
+    assert there.moved([sunlit]) is None
+    assert isinstance(there.moved([replace(shaded, center=torch.tensor([1.2, 1.4, 0.3]))]), SceneLight)

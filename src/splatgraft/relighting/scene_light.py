@@ -52,7 +52,8 @@ class SceneLight:
             spheres: The objects' new bounding spheres.
 
         Returns:
-            None if the objects are too far from the maps' middle, or need larger or much smaller maps.
+            None if the objects are too far from the maps' middle, need larger or much smaller maps, or moved between
+            the sun and a shade.
         """
         place, region = place_of(spheres), self.maps.region
         least, most = (factor * place.radius * self.reach for factor in _KEPT_RADII)
@@ -64,6 +65,8 @@ class SceneLight:
             estimate = self.estimate.at(self.captured, place)
             if isinstance(estimate, NoLight):
                 return estimate
+            if estimate.is_shaded != self.estimate.is_shaded:
+                return None  # the maps belong to the same sources
             light = estimate.light
         there = replace(self, light=light, estimate=estimate, samples=sample_light(light))
         if len(spheres) == len(self.receivers_of) and all(
