@@ -553,7 +553,7 @@ ROWS: Mapping[str, Row] = {
     "sun-unseen-shade": Row(
         "sun",
         "no sun in the shade of things that were not captured",
-        {"relighting.light.unseen_shade.OpenGround.is_shaded": lambda ground, place: False},
+        {"relighting.light.known_sun.OpenGround.is_shaded": lambda ground, place: False},
     ),
     "sun-strength": Row(
         "sun",

@@ -89,7 +89,7 @@ def right_and_wrong(captured: CapturedScene, region: BoundingSphere, truth: Ligh
     near = (directions @ torch.tensor(strong).reshape(-1, 3).T > _APART).any(1)
 
     def best(which: Tensor) -> float:
-        found = shown.best(directions[which], lambda these: torch.zeros(len(these)))[1] if bool(which.any()) else 0.0
+        found = shown.best(directions[which])[1] if bool(which.any()) else 0.0
         return max(found, 0.0)
 
     return best(near) if strong else None, best(~near)

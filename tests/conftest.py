@@ -59,7 +59,7 @@ def finished_project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _no_open_files() -> Iterator[None]:
     """Collect garbage after each module, so that a file left open fails there and not later by chance.
 
-    What is left lives on, and is not searched again: half a second for each module.
+    Objects that are still in use are left out of later searches, which saves half a second for each module.
     """
     yield
     gc.collect()

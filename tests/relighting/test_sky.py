@@ -151,7 +151,7 @@ def test_the_sun_is_known_by_the_clock_then_by_the_sky_then_by_the_brightest_sou
     for scene in (clear, CapturedScene(clear.gaussians, clear.cameras, clock_at(SUN))):
         shown = clear_sky_evidence(scene)
         assert shown is not None
-        assert shown.is_clear > 0.5  # without a sky
+        assert shown.is_clear > 0.5  # the probability where no sky is seen
 
 
 @pytest.mark.parametrize("turbidity", [2.0, 4.0])

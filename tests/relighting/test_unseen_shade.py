@@ -9,9 +9,8 @@ from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.gaussians import concatenate
 from splatgraft.core.images import srgb_from_linear
 from splatgraft.relighting.captured_scene import CapturedScene
-from splatgraft.relighting.light.known_sun import clear_ratio
+from splatgraft.relighting.light.known_sun import OpenGround, clear_ratio
 from splatgraft.relighting.light.sun import UNSEEN_RADIUS_DEG, Sun
-from splatgraft.relighting.light.unseen_shade import OpenGround
 
 SUN = torch.nn.functional.normalize(torch.tensor([0.3, -0.3, 0.9]), dim=0)
 REGION = BoundingSphere(torch.tensor([0.0, 0.0, 0.15]), 2.4)
@@ -43,8 +42,14 @@ def test_a_place_is_shaded_where_the_same_ground_beside_it_is_sunlit():
 
 @pytest.mark.parametrize(
     ("patch", "others"),
-    [(GRASS, GRASS), (SUNLIT, SUNLIT), (SUNLIT, GRASS), (0.12 * SUNLIT, SUNLIT), (GRASS, SUNLIT.flip(0))],
-    ids=["shade everywhere", "sun everywhere", "in the only sun", "darker ground in the sun", "another material"],
+    [
+        pytest.param(GRASS, GRASS, id="shade everywhere"),
+        pytest.param(SUNLIT, SUNLIT, id="sun everywhere"),
+        pytest.param(SUNLIT, GRASS, id="in the only sun"),
+        pytest.param(0.12 * SUNLIT, SUNLIT, id="darker ground in the sun"),
+        pytest.param(GRASS, SUNLIT.flip(0), id="brighter and bluer ground"),
+        pytest.param(GRASS, SUNLIT * torch.tensor([1.0, 1.3, 1.0]), id="greener ground in the sun"),
+    ],
 )
 def test_a_place_is_not_shaded_without_sunlit_ground_of_its_material(patch, others):
     assert not ground(patch, others).is_shaded(IN_PATCH)

@@ -230,11 +230,11 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
 
 
 def _light_note(scene: SceneLight) -> Note:
-    """Describe the light at the new place, and warn if most of it is a guess."""
+    """Describe the light at the new place, with a warning if most of it is a guess."""
     is_clear = scene.estimate is not None and scene.estimate.sky is not None
-    is_shaded = scene.estimate is not None and scene.estimate.is_shaded
-    place = "At the new place" + ", under a clear sky" * is_clear
-    place += ", in the shade of something that was not photographed" * is_shaded
+    place = "At the new place, under a clear sky" if is_clear else "At the new place"
+    if scene.estimate is not None and scene.estimate.is_shaded:
+        place += ", in the shade of something that was not photographed"
     end = "." if scene.estimate is not None else ", as given."
     text = f"{place}: {describe_light(scene.light, scene.captured.up)}{end}"
     # what no camera saw of a clear sky is no guess

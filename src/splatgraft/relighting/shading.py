@@ -44,13 +44,14 @@ KNOWN_SURFACES = ShadeSettings(floor=0.0, level_share=1.0, tint_share=1.0)
 """Settings for surfaces of known albedo under a light of known level, with no old light whose errors a floor would
 damp."""
 KNOWN_IN_ESTIMATED = replace(KNOWN_SURFACES, level_share=0.41, typical=0.6)
-"""Settings for surfaces of known albedo under a light whose level is estimated from surfaces: the regression of true on
-estimated levels over 40 places (benchmarks/LOG.md). Captures are exposed alike, so their mean counts more than the
-estimate."""
+"""Settings for surfaces of known albedo under a light whose level is estimated from surfaces.
+
+They are the regression of true on estimated levels over 40 places (benchmarks/LOG.md). Captures are exposed alike, so
+their mean counts more than the estimate."""
 LEVEL_ERROR_STOPS = 0.65
 """Standard error of a level that is drawn so, of places left out of that regression."""
 SKY_LEVEL_ERROR_STOPS = 0.3
-"""Standard error of a level by a clear sky; set by hand. Six scenes of three exams have .14 (benchmarks/LOG.md)."""
+"""Standard error of a level by a clear sky; set by hand. Nine scenes of four exams have .13 (benchmarks/LOG.md)."""
 
 
 def soft_cosine(cosine: Float[Tensor, "n k"], softness: Float[Tensor, "k"]) -> Float[Tensor, "n k"]:

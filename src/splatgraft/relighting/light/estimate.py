@@ -7,14 +7,15 @@
    sun that is known from the photos' clock or, out of doors, from a clear sky or as the brightest source that no camera
    saw (`known_sun.py`). It moves to the shadows and takes the strength that these show, or else the most probable one.
    If the views show a clear sky (`sky.py`), the radiance that no camera saw is that of this sky, and the sun is added
-   to it with a clear sky's strength. In the shade of something that was not captured (`unseen_shade.py`) there is no
-   sun, and all other light stays.
+   to it with a clear sky's strength. In the shade of something that was not captured
+   (`known_sun.OpenGround`) there is no sun.
 5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,7 +28,7 @@ from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import LUMINANCE
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.evidence import find_highlights, find_shading_evidence
-from splatgraft.relighting.light.known_sun import clear_ratio, known_sun, sun_towards
+from splatgraft.relighting.light.known_sun import OpenGround, clear_ratio, known_sun, sun_towards
 from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
@@ -52,7 +53,6 @@ from splatgraft.relighting.light.sun import (
     with_sun,
     without_sun,
 )
-from splatgraft.relighting.light.unseen_shade import OpenGround
 from splatgraft.rendering import render
 
 # the evidence; set by hand
@@ -96,9 +96,9 @@ class EstimatedLight:
     evidence: LightEvidence
     """Evidence for the estimate."""
     place: BoundingSphere
-    """Place at which the sources were estimated."""
+    """Place of the light."""
 
-    @property
+    @cached_property
     def is_shaded(self) -> bool:
         """Whether something that was not captured shades the place from `found_sun`."""
         return self.ground is not None and self.ground.is_shaded(self.place)
@@ -113,9 +113,8 @@ class EstimatedLight:
         """The estimate, including the sun."""
         if self.found_sun is None:
             return self.mean
-        if self.is_shaded:
-            return without_sun(self.mean, self.found_sun, is_added=self.sky is not None)
-        return with_sun(self.mean, self.found_sun, is_added=self.sky is not None)
+        changed = without_sun if self.is_shaded else with_sun
+        return changed(self.mean, self.found_sun, is_added=self.sky is not None)
 
     def rest(self) -> Float[Tensor, "k 3"]:
         """Return the linear rgb radiance of all `DIRECTIONS` without the sources, to which ambient light is fitted."""

@@ -10,6 +10,9 @@ all other light, has a posterior:
   estimate has beside its sources.
 - The prior is a mixture. Under a clear sky the strength is known from the sun's height; otherwise every strength up to
   that is as likely, on a logarithmic scale.
+
+A tree that no view shows may shade a place from a sun that shines beside it. The ground around the place tells
+(`OpenGround`).
 """
 
 import math
@@ -19,13 +22,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.clock_sun import ClockSun, clock_directions
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import DIRECTIONS
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceProblem
 from splatgraft.relighting.light.sky import SkyEvidence, suns_above
-from splatgraft.relighting.light.sun import ERROR_DEG, LOWEST_SINE, Sun, prior_near
+from splatgraft.relighting.light.sun import (
+    ERROR_DEG,
+    LOWEST_SINE,
+    MAX_GREEN,
+    SURFACES,
+    Sun,
+    draw_surface,
+    find_surfaces,
+    prior_near,
+    standing_on,
+    tones,
+)
 
 # a clear sky, fitted by benchmarks/fit_sky.py
 _CLEAR = 11.2  # strength of the sun over the sine of its height
@@ -40,6 +55,12 @@ _LEAST = 0.1  # strength below which the sun is hidden
 _SUN_RADIUS_DEG = 0.27
 _NEAR = 2.5  # standard errors between the clock's sun and an estimated source that may be the same
 _ROUNDS = 8  # iterations of reweighting
+
+# a shade that nothing captured casts; set by hand
+_AT_PLACE = 1.5  # object radii from the object's middle within which ground is at its place
+_FEWEST = 8  # texels of that ground
+_IS_OPEN = 0.9  # share of the sun's light that passes the captured things; ground with less is in their shade
+_SUNLIT = 0.03  # share of sunlit ground that shows a shade: 17 places outdoors have 0 in the sun, .06 in a shade
 
 BY_CLOCK = "sun by the photos' clock"
 """Name in reports."""
@@ -123,6 +144,54 @@ def sun_towards(
     if strength < _LEAST:
         return None
     return replace(sun, radius_deg=_SUN_RADIUS_DEG, ratio=strength * torch.tensor(_TINT))
+
+
+@dataclass(frozen=True)
+class OpenGround:
+    """m texels of level ground, not in the shade of captured things.
+
+    Sunlight makes ground several times brighter, and redder. So a place is in the shade of something that was not
+    captured if some ground of the same material around it is brighter and redder by a clear sky's sun.
+    """
+
+    points: Float[Tensor, "m 3"]
+    """World units."""
+    tones: Float[Tensor, "m 3"]
+    """As of `sun.tones`."""
+    sunlight: Float[Tensor, "2"]
+    """Change of the first two tones from shade to a clear sky's sun."""
+
+    @staticmethod
+    def around(captured: CapturedScene, region: BoundingSphere, sun: Sun) -> "OpenGround":
+        """Collect the ground of a region.
+
+        Args:
+            captured: The scene with all objects that cast shadows during the capture.
+            region: Sphere around the place.
+            sun: The sun; its strength is not read.
+        """
+        points, found = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
+        for surface in find_surfaces(captured, region, most=SURFACES):
+            picture, standing = draw_surface(captured, surface), standing_on(surface, captured.gaussians, region)
+            is_open = picture.valid & (surface.shadows(standing, sun.direction[None])[0] > _IS_OPEN)
+            points.append(surface.texels()[is_open])
+            found.append(tones(picture.log_rgb[is_open]))
+        lit_over_shaded = 1 + clear_ratio(float(sun.direction @ captured.up))
+        return OpenGround(torch.cat(points), torch.cat(found), tones(lit_over_shaded.log())[:2])
+
+    def is_shaded(self, place: BoundingSphere) -> bool:
+        """Return whether the ground at an object's place is in the shade of something that was not captured.
+
+        Args:
+            place: The object's bounding sphere.
+        """
+        at_place = (self.points - place.center).norm(dim=1) < _AT_PLACE * place.radius
+        if int(at_place.sum()) < _FEWEST:
+            return False
+        away = self.tones - self.tones[at_place].median(0).values
+        is_same_material = away[:, 2].abs() < MAX_GREEN
+        is_sunlit = (away[:, :2] / self.sunlight - 1).abs().amax(1) < 0.5  # nearer to sunlit ground than to the place
+        return float(is_sunlit[is_same_material].float().mean()) > _SUNLIT
 
 
 def _joined(

@@ -171,6 +171,16 @@ class SurfacePicture:
     """Whether enough views show the texel, neither clipped nor black."""
 
 
+def tones(log_rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Return logarithms of luminance, of red over blue, and of green over the geometric mean of red and blue.
+
+    Args:
+        log_rgb: Logarithm of linear rgb.
+    """
+    red, green, blue = log_rgb.unbind(-1)
+    return torch.stack([(log_rgb.exp() @ LUMINANCE).log(), red - blue, green - 0.5 * (red + blue)], -1)
+
+
 def find_surfaces(captured: CapturedScene, region: BoundingSphere, *, most: int = 1) -> list[Surface]:
     """Find up to `most` level surfaces that the cameras see in a region, the largest first."""
     seen = []
@@ -278,9 +288,8 @@ class _Comparison:
         step = step or max(2, apart // 2)
         every = step if apart % step == 0 else 1
         log_rgb, valid = picture.log_rgb[::every, ::every], picture.valid[::every, ::every]
-        log_luminance = (log_rgb.exp() @ LUMINANCE).log()
-        red, green, blue = log_rgb.unbind(-1)
-        chroma = torch.stack([(green - 0.5 * (red + blue)) / MAX_GREEN, (red - blue) / _MAX_RED], -1)
+        log_luminance, red_over_blue, green = tones(log_rgb).unbind(-1)
+        chroma = torch.stack([green / MAX_GREEN, red_over_blue / _MAX_RED], -1)
         tile = torch.arange(0, _SIZE, every) * _TILES // _SIZE
         tile = tile[:, None] * _TILES + tile
         skip, gap = step // every, apart // every
@@ -683,7 +692,14 @@ def with_sun(light: Light, sun: Sun, *, is_added: bool = False) -> Light:
 
 
 def without_sun(light: Light, sun: Sun, *, is_added: bool = False) -> Light:
-    """Make the light in the shade of a sun: remove the infinitely distant sources of a light, as `with_sun` does."""
+    """Remove the infinitely distant sources of a light, for a place in the shade of a sun.
+
+    Args:
+        light: The estimated light.
+        sun: The sun that does not reach the place; its normal alone is read.
+        is_added: Whether all other light is known, so that it stays as it is. Otherwise the irradiance on the surface
+            stays the same.
+    """
     others = _without_distant_sources(light)
     before, shaded = (one.irradiance(sun.normal[None])[0] @ LUMINANCE for one in (light, others))
     return others if is_added else _scaled(others, float(before / shaded))
