@@ -41,6 +41,7 @@ from splatgraft.relighting import LayerWeights, Light, Relit, relight
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.estimate import _ambient_of, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, _nothing, _smooth_lobe
+from splatgraft.relighting.light.known_sun import known_sun
 from splatgraft.relighting.light.panorama import DIRECTIONS, Surroundings, place_surroundings
 from splatgraft.relighting.light.radiance_model import (
     LightEvidence,
@@ -263,6 +264,10 @@ def without_object(captured: CapturedScene, place: Any, *, object_gaussians: Gau
 def changed_sun(captured: CapturedScene, region: Any, **changes: Any) -> Sun | None:
     sun = find_sun(captured, region)
     return None if sun is None else replace(sun, **changes)
+
+
+def no_sun_by_shading(captured: CapturedScene, main: Any, sky: Any, *, outdoors: bool, is_unseen: bool) -> Any:
+    return known_sun(captured, main, sky, outdoors=False, is_unseen=is_unseen)
 
 
 def density(**changes: float) -> dict[str, object]:
@@ -513,6 +518,9 @@ ROWS: Mapping[str, Row] = {
     "near-surfaces": Row("radiance", "weight of near surfaces", density(near=_MANY)),
     "effective": Row("radiance", "dependence of neighbours' errors", density(effective=1000.0)),
     "albedo": Row("radiance", "prior of albedos", density(albedo_sd=_MANY)),
+    "albedo-outdoors": Row(
+        "radiance", "darker materials out of doors", density(albedo_outdoors=RadianceSettings().albedo)
+    ),
     "material-count": Row("radiance", "limit of independent albedos", density(materials=_MANY)),
     "sky": Row("radiance", "prior of the unseen level", density(sky_sd=_MANY)),
     "unseen-tails": Row("radiance", "heavy tails of unseen directions", density(unseen_nu=_MANY)),
@@ -540,7 +548,7 @@ ROWS: Mapping[str, Row] = {
     "sun-outdoors": Row(
         "sun",
         "the brightest unseen source out of doors is the sun",
-        {"relighting.light.estimate._is_outdoors": lambda far, up: False},
+        {"relighting.light.estimate.known_sun": no_sun_by_shading},
     ),
     "sun-sky": Row(
         "sun", "a clear sky shows sun and sky", {"relighting.light.estimate.clear_sky_evidence": lambda captured: None}
@@ -574,11 +582,6 @@ ROWS: Mapping[str, Row] = {
         "sun",
         "unseen things may shade texels and tiles",
         {"relighting.light.sun._SHADED_TEXEL": 1e-6, "relighting.light.sun._SHADED_TILE": 1e-6},
-    ),
-    "sun-colors": Row(
-        "sun",
-        "the sun's texels compared in one colour alone",
-        {"relighting.light.sun.MAX_GREEN": _MANY, "relighting.light.sun._MAX_RED": _MANY},
     ),
 }
 """Rows by name: the first stage that is changed, what is switched off, and how."""

@@ -39,6 +39,7 @@ from splatgraft_paper.exam.scenes import ExamScene
 NORMALS = even_directions(200)
 FACTORS = {
     "albedo": 1.3,
+    "albedo_outdoors": 1.3,
     "albedo_sd": 1.4,
     "materials": 1.7,
     "residual": 1.3,
@@ -134,9 +135,9 @@ def objective(found: Float[Tensor, "s 3"]) -> float:
 
 
 def fit(
-    scenes: Scenes, which: Sequence[int], numbers: dict[str, float], *, minutes: float, seed: int
+    scenes: Scenes, which: Sequence[int], numbers: dict[str, float], names: Sequence[str], *, minutes: float, seed: int
 ) -> dict[str, float]:
-    """Search the best parameters for some scenes at random, for `minutes`.
+    """Search the best values of the parameters `names` for some scenes at random, for `minutes`.
 
     A change that is worse on half of the scenes is not tried on the others.
     """
@@ -147,7 +148,7 @@ def fit(
     print(f"start {best:.3f}", flush=True)
     while time.monotonic() < end:
         changed = dict(numbers)
-        for name in rng.sample([*FACTORS, *SHIFTS], rng.choice([1, 1, 2, 3])):
+        for name in rng.sample(names, min(rng.choice([1, 1, 2, 3]), len(names))):
             if name in SHIFTS:
                 changed[name] = round(numbers[name] + rng.gauss(0, SHIFTS[name]), 3)
             else:
@@ -173,6 +174,8 @@ def main() -> None:
     parser.add_argument("--folds", type=int, default=0, help="number of parts of the cross-validation; 0: none")
     parser.add_argument("--out", type=Path, help="file that receives the parameters as JSON")
     parser.add_argument("--seed", type=int, default=0)
+    names = [*FACTORS, *SHIFTS]
+    parser.add_argument("--names", nargs="+", choices=names, default=names, help="parameters that are fitted")
     parser.add_argument("--start", type=Path, help="parameters to start from, a file of --out")
     options = parser.parse_args()
     pairs = {}
@@ -190,11 +193,11 @@ def main() -> None:
     for fold in range(options.folds):
         inside = [i for i in everything if i % options.folds != fold]
         outside = [i for i in everything if i % options.folds == fold]
-        found = fit(scenes, inside, numbers, minutes=options.minutes, seed=options.seed + fold)
+        found = fit(scenes, inside, numbers, options.names, minutes=options.minutes, seed=options.seed + fold)
         print(f"fold {fold}: fitted {objective(scenes.errors(found, inside)):.3f}", end=" ")
         left = [objective(scenes.errors(one, outside)) for one in (found, numbers)]
         print(f"left out {left[0]:.3f} (before {left[1]:.3f}) {json.dumps(found)}", flush=True)
-    found = fit(scenes, everything, numbers, minutes=options.minutes, seed=options.seed)
+    found = fit(scenes, everything, numbers, options.names, minutes=options.minutes, seed=options.seed)
     rows = scenes.errors(found)
     for name, row in zip(scenes.names, rows, strict=True):
         print(f"{name:20s} new {row[0]:.2f} old {row[1]:.2f} ratio {row[2]:.2f}")

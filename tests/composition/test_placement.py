@@ -473,6 +473,19 @@ def test_an_object_stands_beside_the_captured_figure_on_its_table():
         assert not any(note.in_doubt for note in placed.warnings)
 
 
+def test_specks_above_the_table_leave_it_free():
+    g = torch.Generator().manual_seed(3)
+    across = (torch.rand(200, 2, generator=g) - 0.5) * torch.tensor([1.8, 1.5])
+    specks = blobs(torch.cat([across, torch.full((200, 1), TABLE + 0.1)], 1), 0.009, opacity_logit=4.0)
+    cameras = cameras_that_look_at_the_figure()
+    without, among = (
+        place_object(scene, THING, cameras=(cameras, OWN))
+        for scene in (figure_on_a_table(), concatenate([figure_on_a_table(), specks]))
+    )
+    assert among.target_from_object.scale == without.target_from_object.scale
+    assert abs(float(among.support.point[2]) - TABLE) < 0.02
+
+
 def test_a_bare_table_is_the_support_of_cameras_that_meet_below_it():
     # turned by a sixteenth of their distance, like a hand-held camera; the floor has four times the area
     cameras = ring_of_cameras((0.0, 0, TABLE - 0.1))

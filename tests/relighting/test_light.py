@@ -23,7 +23,7 @@ from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.description import describe_light
-from splatgraft.relighting.light.estimate import EstimatedLight, _is_outdoors, estimate_light
+from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
 from splatgraft.relighting.light.known_sun import BY_CLOCK, direction_by_clock, sun_towards
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient, light_confidence
@@ -36,7 +36,7 @@ from splatgraft.relighting.light.panorama import (
     render_panorama,
     surroundings_at,
 )
-from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
+from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem
 from splatgraft.relighting.light.sun import (
     SET_BY_HAND,
     Sun,
@@ -360,6 +360,16 @@ def sun_of(scene):
     return find_sun(CapturedScene(scene, views()), BoundingSphere(torch.tensor([0.0, 0.0, 0.3]), 2.4))
 
 
+def test_a_shade_that_is_far_bluer_than_sunlit_ground_shows_the_sun():
+    scene = under_sun().gaussians
+    linear = linear_from_srgb(rgb_from_dc(scene.sh[:, 0]))
+    # as on photos of a lawn, but more
+    graded = 0.3 * (linear / 0.3) ** torch.tensor([2.2, 1.6, 0.3])
+    found = sun_of(replace(scene, sh=dc_from_rgb(srgb_from_linear(graded))[:, None]))
+    assert found is not None
+    assert degrees_apart(found.direction, SUN) < 3
+
+
 def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s_edge_shows():
     scene, tops = under_sun().gaussians, torch.tensor([[1.0, 0.2, 0.5], [-0.6, 0.9, 0.5]])
     # the casters are marked slightly off
@@ -486,7 +496,10 @@ def test_a_room_ends_at_its_walls_and_a_garden_does_not(near_height, outdoors):
     scene = concatenate([wall(3.0, near_height), wall(15.0, 20.0)])
     cameras = ring(height=0.5, radius=2.0, focal=50.0)
     far = surroundings_at(scene, cameras, torch.tensor([0.0, 0.0, 0.3]), nearest=1.0)
-    assert _is_outdoors(far, UP) == outdoors
+    evidence = LightEvidence(receivers(torch.zeros(1, 3)), None, far, far, UP)
+    assert evidence.is_outdoors == outdoors
+    settings = RadianceSettings()
+    assert radiance_problem(evidence).settings.albedo == (settings.albedo_outdoors if outdoors else settings.albedo)
 
 
 def test_a_direction_by_the_clock_is_averaged_with_a_source_that_may_be_the_sun():

@@ -2,12 +2,13 @@
 
 The support is the surface on which the captured thing stands, such as a table's top:
 
-1. A height map is drawn from straight above the point.
+1. A height map is drawn from straight above the point. A median filter removes single pixels that stand out, which are
+   noise of the reconstruction.
 2. The levels are the peaks of its histogram of heights; the support is the highest large one.
 3. A plane is fitted to the support by least squares.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,6 +23,7 @@ from splatgraft.rendering import render
 
 # set by hand; lengths over the half width of the map
 _MAP_SIZE_PX = 128  # width and height of the height map
+_MEDIAN_PX = 3  # width of the median filter of heights
 _MIN_TOP = 0.05  # least height of the mapped space above the focus point
 _CENTER_SPREAD = 0.5  # standard deviation of the distance from the focus point in the weights
 _MIN_AREA = 0.2
@@ -85,6 +87,7 @@ def measure_ground(
     # surfaces lie below most cameras; ceilings and lamps do not
     top = max(float(((cameras.centers - focus) @ up).median()), _MIN_TOP * reach)
     surface = height_map(target, focus, up=up, radius=reach, top=top, size=_MAP_SIZE_PX)
+    surface = replace(surface, heights=torch.from_numpy(ndimage.median_filter(surface.heights.numpy(), _MEDIAN_PX)))
     solid = surface.alpha > 0.5
     if not bool(solid.any()):
         raise ValueError(

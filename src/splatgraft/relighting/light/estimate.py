@@ -35,7 +35,6 @@ from splatgraft.relighting.light.panorama import (
     FARTHEST,
     SOLID_ANGLE,
     NoLight,
-    Surroundings,
     panorama_at,
     place_surroundings,
     surroundings_at,
@@ -69,8 +68,6 @@ _SUN = 0.03  # steradians; a smaller clipped patch may show the sun, whose rays 
 _LAMP = 0.64  # sine of the height above which a source in a room is named a lamp, otherwise a window
 _SEEN_NAMES = ("window", "lamp")  # low and high sources with a surface behind them
 _UNSEEN_NAMES = ("sun or window", "sun or lamp")  # low and high sources that no camera saw
-_AT_HORIZON, _ABOVE_HORIZON = (-0.1, 0.2), (0.1, 0.4)  # sines of heights; set by hand
-_OPEN = 1.2  # ratio of the distances seen there; rooms have up to 1.19, gardens and terraces 1.23 or more (log)
 
 # the view towards a source; set by hand
 _SOURCE_QUANTILE = 0.25  # quantile of the depths in that view that is the distance to the source
@@ -188,13 +185,12 @@ def estimate_light(
     problem = radiance_problem(evidence)
     hidden = search_radiance(problem)
     sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
-    outdoors = _is_outdoors(evidence.far, captured.up)
-    sky = clear_sky_evidence(captured) if outdoors else None
+    sky = clear_sky_evidence(captured) if evidence.is_outdoors else None
     sun, known = set_sun(sun_through, whole) if sun_through else find_sun(whole, region), None
     if sun is None:
         main = next(iter(sources), None)
         is_unseen = main is not None and main.name in _UNSEEN_NAMES
-        known = known_sun(captured, main, sky, outdoors=outdoors, is_unseen=is_unseen)
+        known = known_sun(captured, main, sky, outdoors=evidence.is_outdoors, is_unseen=is_unseen)
         sun = None if known is None else sun_near(known.directions, known.log_density, whole, region, name=known.name)
     clear = None if sky is None or sun is None else sky.sky_with(sun.direction)
     if clear is not None and sun is not None:
@@ -205,16 +201,9 @@ def estimate_light(
     if known is not None and sun is not None and sun.ratio is None:
         sun = sun_towards(sun, sky, problem, evidence, rest)
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
-    ground = None if sun is None or sun_through or not outdoors else OpenGround.around(whole, region, sun)
+    ground = None if sun is None or sun_through or not evidence.is_outdoors else OpenGround.around(whole, region, sun)
     found = EstimatedLight(mean, None, ground, hidden, clear, evidence, place)
     return found if sun is None else found.with_sun(sun, scene)
-
-
-def _is_outdoors(far: Surroundings, up: Float[Tensor, "3"]) -> bool:
-    """Whether what the cameras see above the horizon is farther away than at the horizon; a room's walls are not."""
-    sine, seen = DIRECTIONS @ up, far.seen > 0.5
-    at, above = (far.distance[seen & (sine > low) & (sine < high)] for low, high in (_AT_HORIZON, _ABOVE_HORIZON))
-    return len(at) > 0 and len(above) > 0 and float(above.median()) > _OPEN * float(at.median())
 
 
 def region_around(place: BoundingSphere, cameras: Cameras) -> BoundingSphere:

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.clock_sun import ClockSun, clock_directions
+from splatgraft.core.images import LUMINANCE
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import DIRECTIONS
@@ -32,14 +33,12 @@ from splatgraft.relighting.light.sky import SkyEvidence, suns_above
 from splatgraft.relighting.light.sun import (
     ERROR_DEG,
     LOWEST_SINE,
-    MAX_GREEN,
     SURFACES,
     Sun,
     draw_surface,
     find_surfaces,
     prior_near,
     standing_on,
-    tones,
 )
 
 # a clear sky, fitted by benchmarks/fit_sky.py
@@ -60,6 +59,7 @@ _ROUNDS = 8  # iterations of reweighting
 _AT_PLACE = 1.5  # object radii from the object's middle within which ground is at its place
 _FEWEST = 8  # texels of that ground
 _IS_OPEN = 0.9  # share of the sun's light that passes the captured things; ground with less is in their shade
+_MAX_GREEN = 0.15  # largest difference of log(green / sqrt(red blue)) within one material
 _SUNLIT = 0.03  # share of sunlit ground that shows a shade: 17 places outdoors have 0 in the sun, .06 in a shade
 
 BY_CLOCK = "sun by the photos' clock"
@@ -157,7 +157,7 @@ class OpenGround:
     points: Float[Tensor, "m 3"]
     """World units."""
     tones: Float[Tensor, "m 3"]
-    """As of `sun.tones`."""
+    """As of `_tones`."""
     sunlight: Float[Tensor, "2"]
     """Change of the first two tones from shade to a clear sky's sun."""
 
@@ -175,9 +175,9 @@ class OpenGround:
             picture, standing = draw_surface(captured, surface), standing_on(surface, captured.gaussians, region)
             is_open = picture.valid & (surface.shadows(standing, sun.direction[None])[0] > _IS_OPEN)
             points.append(surface.texels()[is_open])
-            found.append(tones(picture.log_rgb[is_open]))
+            found.append(_tones(picture.log_rgb[is_open]))
         lit_over_shaded = 1 + clear_ratio(float(sun.direction @ captured.up))
-        return OpenGround(torch.cat(points), torch.cat(found), tones(lit_over_shaded.log())[:2])
+        return OpenGround(torch.cat(points), torch.cat(found), _tones(lit_over_shaded.log())[:2])
 
     def is_shaded(self, place: BoundingSphere) -> bool:
         """Return whether the ground at an object's place is in the shade of something that was not captured.
@@ -189,9 +189,19 @@ class OpenGround:
         if int(at_place.sum()) < _FEWEST:
             return False
         away = self.tones - self.tones[at_place].median(0).values
-        is_same_material = away[:, 2].abs() < MAX_GREEN
+        is_same_material = away[:, 2].abs() < _MAX_GREEN
         is_sunlit = (away[:, :2] / self.sunlight - 1).abs().amax(1) < 0.5  # nearer to sunlit ground than to the place
         return float(is_sunlit[is_same_material].float().mean()) > _SUNLIT
+
+
+def _tones(log_rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+    """Return logarithms of luminance, of red over blue, and of green over the geometric mean of red and blue.
+
+    Args:
+        log_rgb: Logarithm of linear rgb.
+    """
+    red, green, blue = log_rgb.unbind(-1)
+    return torch.stack([(log_rgb.exp() @ LUMINANCE).log(), red - blue, green - 0.5 * (red + blue)], -1)
 
 
 def _joined(

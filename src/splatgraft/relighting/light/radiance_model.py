@@ -21,7 +21,7 @@ The likelihood of the highlights is a function of the share of view-dependent ch
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -35,6 +35,8 @@ _ABOVE_MAX = 100.0  # precision of the prior that keeps albedos below the maximu
 _TOUCHING = math.cos(math.radians(15))  # clipped directions nearer than this are one patch
 _LOWEST = math.sin(math.radians(-8))  # lowest sine of a source's height; windows reach below the horizon
 _MAX_PATCHES = 5  # clipped patches that may be sources; the search tries all their combinations
+_AT_HORIZON, _ABOVE_HORIZON = (-0.1, 0.2), (0.1, 0.4)  # sines of heights; set by hand
+_OPEN = 1.2  # ratio of the distances seen there; rooms have up to 1.19, gardens and terraces 1.23 or more (log)
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,9 @@ class RadianceSettings:
     """Parameters of the density, fitted together over training scenes by benchmarks/fit_light.py."""
 
     albedo: float = 0.29
-    """Median linear albedo of a material."""
+    """Median linear albedo of a material in a room."""
+    albedo_outdoors: float = 0.208
+    """Median linear albedo of a material out of doors: lawns, soil and leaves are darker than walls and furniture."""
     albedo_sd: float = 0.332
     """Standard deviation of the log albedo."""
     materials: float = 9.04
@@ -94,6 +98,13 @@ class LightEvidence:
     """Surroundings of the object, near surfaces included."""
     up: Float[Tensor, "3"]
     """Unit, world frame."""
+
+    @property
+    def is_outdoors(self) -> bool:
+        """Whether what is seen above the horizon is farther away than at the horizon; a room's walls are not."""
+        sine, seen, distance = DIRECTIONS @ self.up, self.far.seen > 0.5, self.far.distance
+        at, above = (distance[seen & (sine > low) & (sine < high)] for low, high in (_AT_HORIZON, _ABOVE_HORIZON))
+        return len(at) > 0 and len(above) > 0 and float(above.median()) > _OPEN * float(at.median())
 
     @property
     def visible_sources(self) -> Float[Tensor, "k"]:
@@ -233,7 +244,7 @@ def radiance_problem(found: LightEvidence, *, settings: RadianceSettings = Radia
         settings: Parameters of the density.
     """
     evidence, far, around, up = found.surfaces, found.far, found.around, found.up
-    s = settings
+    s = replace(settings, albedo=settings.albedo_outdoors) if found.is_outdoors else settings
     # smaller shares get no unknown
     unseen = (torch.maximum(1 - far.seen, 1 - around.seen) > 0.05).nonzero()[:, 0]
     clipped = (far.clipped > 0.02).nonzero()[:, 0]

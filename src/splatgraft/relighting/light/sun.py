@@ -46,9 +46,6 @@ _WHITE, _BLACK = 0.93, 0.01  # linear; brighter channels may be clipped, darker 
 
 # differences between texels; set by hand
 _COARSE, _FINE, _ACROSS = 6, 3, 14  # texels between compared texels: search, refinement, ratio of lit to shaded
-MAX_GREEN, _MAX_RED = 0.15, 1.2
-"""Largest differences of log(green / sqrt(red blue)) and of log(red / blue) within one material. The second is larger
-because sun and sky differ along it."""
 _NOISE = 0.12  # scale of differences of log luminance within a material
 _SHADED_TEXEL, _SHADED_TILE = 0.15, 0.5  # probabilities that something unseen shades a texel, and a whole tile
 _TILES = 8  # tiles along a side of the picture
@@ -171,16 +168,6 @@ class SurfacePicture:
     """Whether enough views show the texel, neither clipped nor black."""
 
 
-def tones(log_rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Return logarithms of luminance, of red over blue, and of green over the geometric mean of red and blue.
-
-    Args:
-        log_rgb: Logarithm of linear rgb.
-    """
-    red, green, blue = log_rgb.unbind(-1)
-    return torch.stack([(log_rgb.exp() @ LUMINANCE).log(), red - blue, green - 0.5 * (red + blue)], -1)
-
-
 def find_surfaces(captured: CapturedScene, region: BoundingSphere, *, most: int = 1) -> list[Surface]:
     """Find up to `most` level surfaces that the cameras see in a region, the largest first."""
     seen = []
@@ -278,7 +265,7 @@ class _Comparison:
 
     @staticmethod
     def of(picture: SurfacePicture, apart: int, step: int | None = None) -> "_Comparison":
-        """Compare texels that may be one material in sun and shade.
+        """Compare texels.
 
         Args:
             picture: The surface.
@@ -288,8 +275,7 @@ class _Comparison:
         step = step or max(2, apart // 2)
         every = step if apart % step == 0 else 1
         log_rgb, valid = picture.log_rgb[::every, ::every], picture.valid[::every, ::every]
-        log_luminance, red_over_blue, green = tones(log_rgb).unbind(-1)
-        chroma = torch.stack([green / MAX_GREEN, red_over_blue / _MAX_RED], -1)
+        log_luminance = (log_rgb.exp() @ LUMINANCE).log()
         tile = torch.arange(0, _SIZE, every) * _TILES // _SIZE
         tile = tile[:, None] * _TILES + tile
         skip, gap = step // every, apart // every
@@ -297,8 +283,7 @@ class _Comparison:
         position = torch.arange(tile.numel()).reshape(tile.shape)
 
         def along(first: tuple[slice, slice], second: tuple[slice, slice]) -> _Differences:
-            same = (chroma[second] - chroma[first]).abs().amax(-1) < 1
-            chosen = valid[first] & valid[second] & same
+            chosen = valid[first] & valid[second]
             change = (log_luminance[second] - log_luminance[first])[chosen] / _NOISE
             return _Differences(position[first][chosen], position[second][chosen], change, tile[first][chosen])
 
