@@ -368,6 +368,9 @@ def test_a_shade_that_is_far_bluer_than_sunlit_ground_shows_the_sun():
     found = sun_of(replace(scene, sh=dc_from_rgb(srgb_from_linear(graded))[:, None]))
     assert found is not None
     assert degrees_apart(found.direction, SUN) < 3
+    # the grading makes the sun's red over blue 8 times too large
+    assert found.ratio is not None
+    assert float(found.ratio[0] / found.ratio[2]) < 3.5
 
 
 def test_a_sun_through_a_point_and_its_shadow_has_the_strength_that_the_shadow_s_edge_shows():

@@ -71,6 +71,9 @@ _TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a prior, bec
 _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
 _MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
 _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12  # angular radii that are tried, and directions that sample each
+_MAX_TINT = 0.85
+"""Largest absolute log of a channel's ratio over that of luminance. Nine measured suns of rendered scenes have up to
+.87, most .5; the contrast of photographs of a lawn makes it 1.66."""
 UNSEEN_RADIUS_DEG = 1.0  # angular radius of a source that neither a camera nor an edge of a shadow shows
 _LIKELIER = 3.0  # difference of log likelihoods, 20 to 1, for a larger radius, and for the strength near a known sun
 ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for others
@@ -593,7 +596,16 @@ def _radius_and_ratio(shown: _ShadowEvidence, direction: Float[Tensor, "3"]) -> 
         by_radius = torch.maximum(by_radius, fine.of_suns(blurred[:-1], blurred[-1], _STRENGTHS))
         blurred = _blurred(blurred)
     radius = _RADII_DEG[int((by_radius > by_radius.max() - _LIKELIER).int().argmax())]
-    return radius, lit_over_shaded(shown.picture, softened[0], shown.ambient)
+    ratio = lit_over_shaded(shown.picture, softened[0], shown.ambient)
+    return radius, None if ratio is None else _with_bounded_tint(ratio)
+
+
+def _with_bounded_tint(ratio: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Reduce the tint of a ratio, whose luminance stays, because photographs show shade bluer than it is."""
+    luminance = (ratio @ LUMINANCE).clamp_min(1e-6)
+    log_tint = (ratio / luminance).clamp_min(1e-3).log()
+    tint = (log_tint * (_MAX_TINT / log_tint.abs().max().clamp_min(_MAX_TINT))).exp()
+    return luminance * tint / (tint @ LUMINANCE)
 
 
 def _blurred(visible: Float[Tensor, "k s s"]) -> Float[Tensor, "k s s"]:
