@@ -503,6 +503,8 @@ def test_a_room_ends_at_its_walls_and_a_garden_does_not(near_height, outdoors):
     assert evidence.is_outdoors == outdoors
     settings = RadianceSettings()
     assert radiance_problem(evidence).settings.albedo == (settings.albedo_outdoors if outdoors else settings.albedo)
+    named = replace(estimate_of(under_sun()), evidence=evidence).with_sun(Sun(SUN, 0.3, UP, torch.ones(3), 50.0), scene)
+    assert named.light.sources[0].name == ("sun" if outdoors else "sun or window")
 
 
 def test_a_direction_by_the_clock_is_averaged_with_a_source_that_may_be_the_sun():

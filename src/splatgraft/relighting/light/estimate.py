@@ -130,7 +130,9 @@ class EstimatedLight:
         return replace(self, found_sun=replace(named, blockers_within=blockers_within))
 
     def _name_at(self, direction: Float[Tensor, "3"]) -> str:
-        """Name a source found from shadows by a photographed one within 20 degrees, or by its possible kinds."""
+        """Name a distant source found from shadows: a sun outdoors, else as a photographed source within 20 degrees."""
+        if self.evidence.is_outdoors:
+            return "sun"
         near = (s for s in self.mean.sources if float(torch.tensor(s.direction) @ direction.float()) > 0.94)
         names = [source.name for source in near if source.name in _SEEN_NAMES]
         return names[0] if names else _UNSEEN_NAMES[float(direction.float() @ self.evidence.up) > _LAMP]
