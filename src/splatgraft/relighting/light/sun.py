@@ -10,7 +10,7 @@
    is mixed with the chance that something unseen shades a texel, or a whole tile of the picture.
 4. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
 5. Compare the sun with lamps at a few heights, whose shadows diverge.
-6. If no direction is decisively better than no sun, do the same in a wider region.
+6. If no direction is decisively better than no sun, do the same within the cameras' median distance.
 
 Where a sun is known to exist, `sun_near` moves it to the shadows of several surfaces.
 
@@ -409,9 +409,9 @@ class _ShadowEvidence:
 
 
 def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float = _DECISIVE) -> Sun | None:
-    """Find the sun, or the lamp, whose shadows a level surface shows, in the region or else in a wider one.
+    """Find the sun, or the lamp, whose shadows a level surface shows.
 
-    The wider region is at most as large as the cameras' distance. So it is left out if the object fills the views.
+    If the region shows none, the surface within the cameras' median distance is searched.
 
     Args:
         captured: The scene with all objects that cast shadows during the capture.
@@ -422,8 +422,7 @@ def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float
         The sun; None if no direction is decisively better than no sun.
     """
     distance = float((captured.cameras.centers - region.center).norm(dim=1).median())
-    wider = max(region.radius, min(_WIDER * region.radius, distance))
-    radii = dict.fromkeys((region.radius, wider))
+    radii = dict.fromkeys((region.radius, max(region.radius, distance)))
     found = (_find_sun_within(captured, replace(region, radius=radius), decisive) for radius in radii)
     return next((sun for sun in found if sun is not None), None)
 
