@@ -23,7 +23,7 @@ from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.description import describe_light
-from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
+from splatgraft.relighting.light.estimate import EstimatedLight, _source, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
 from splatgraft.relighting.light.known_sun import BY_CLOCK, direction_by_clock, sun_towards
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient, light_confidence
@@ -505,6 +505,10 @@ def test_a_room_ends_at_its_walls_and_a_garden_does_not(near_height, outdoors):
     assert evidence.is_outdoors == outdoors
     settings = RadianceSettings()
     assert radiance_problem(evidence).settings.albedo == (settings.albedo_outdoors if outdoors else settings.albedo)
+    clipped = replace(far, clipped=torch.ones_like(far.clipped))
+    bright, patch = replace(evidence, far=clipped, around=clipped), torch.arange(len(DIRECTIONS)) == 200
+    assert float(far.distance[patch]) < 20
+    assert _source(patch, torch.ones(1, 3), bright, within=1.0).name == ("bright patch" if outdoors else "window")
     named = replace(estimate_of(under_sun()), evidence=evidence).with_sun(Sun(SUN, 0.3, UP, torch.ones(3), 50.0), scene)
     assert named.light.sources[0].name == ("sun" if outdoors else "sun or window")
 

@@ -66,7 +66,8 @@ _MAX_SOURCES = 4
 _NEIGHBOUR_COSINE = math.cos(math.radians(14))  # directions nearer to the brightest one belong to its source
 _SUN = 0.03  # steradians; a smaller clipped patch may show the sun, whose rays are parallel
 _LAMP = 0.64  # sine of the height above which a source in a room is named a lamp, otherwise a window
-_SEEN_NAMES = ("window", "lamp")  # low and high sources with a surface behind them
+_SEEN_NAMES = ("window", "lamp")  # low and high sources in a room with a surface behind them
+_SEEN_OUTDOORS = "bright patch"
 _UNSEEN_NAMES = ("sun or window", "sun or lamp")  # low and high sources that no camera saw
 
 # the view towards a source; set by hand
@@ -263,7 +264,8 @@ def _source(
     if visible > 0:
         size = max(visible, 0.1) * SOLID_ANGLE
         distance = _mean_distance(evidence.far.distance[group], weight * shares)
-        name = _SEEN_NAMES[float(direction @ evidence.up) > _LAMP] if distance < 0.5 * FARTHEST else "sun"
+        in_room = _SEEN_NAMES[float(direction @ evidence.up) > _LAMP]
+        name = "sun" if distance >= 0.5 * FARTHEST else _SEEN_OUTDOORS if evidence.is_outdoors else in_room
         # a small patch may show the sun through a window; a large one has the distance of the panorama
         distance = math.inf if size < _SUN else distance
         # the middle of a clipped patch is about 2 degrees off
