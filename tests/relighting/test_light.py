@@ -363,7 +363,7 @@ def sun_of(scene):
 def test_a_shade_that_is_far_bluer_than_sunlit_ground_shows_the_sun():
     scene = under_sun().gaussians
     linear = linear_from_srgb(rgb_from_dc(scene.sh[:, 0]))
-    # as on photos of a lawn, but more
+    # the shade becomes bluer than on photos of a lawn
     graded = 0.3 * (linear / 0.3) ** torch.tensor([2.2, 1.6, 0.3])
     found = sun_of(replace(scene, sh=dc_from_rgb(srgb_from_linear(graded))[:, None]))
     assert found is not None

@@ -46,8 +46,8 @@ damp."""
 KNOWN_IN_ESTIMATED = replace(KNOWN_SURFACES, level_share=0.41, typical=0.6)
 """Settings for surfaces of known albedo under a light whose level is estimated from surfaces.
 
-They are the regression of true on estimated levels over 40 places (benchmarks/LOG.md). Captures are exposed alike, so
-their mean counts more than the estimate."""
+The share and the typical ratio are the regression of true on estimated levels over 40 places (benchmarks/LOG.md).
+Captures are exposed alike, so the mean of these levels counts more than the estimate."""
 LEVEL_ERROR_STOPS = 0.65
 """Standard error of a level that is drawn so, of places left out of that regression."""
 SKY_LEVEL_ERROR_STOPS = 0.3

@@ -67,7 +67,7 @@ _NEIGHBOUR_COSINE = math.cos(math.radians(14))  # directions nearer to the brigh
 _SUN = 0.03  # steradians; a smaller clipped patch may show the sun, whose rays are parallel
 _LAMP = 0.64  # sine of the height above which a source in a room is named a lamp, otherwise a window
 _SEEN_NAMES = ("window", "lamp")  # low and high sources in a room with a surface behind them
-_SEEN_OUTDOORS = "bright patch"
+_SEEN_OUTDOORS = "bright patch"  # the same outdoors
 _UNSEEN_NAMES = ("sun or window", "sun or lamp")  # low and high sources that no camera saw
 
 # the view towards a source; set by hand
@@ -131,7 +131,11 @@ class EstimatedLight:
         return replace(self, found_sun=replace(named, blockers_within=blockers_within))
 
     def _name_at(self, direction: Float[Tensor, "3"]) -> str:
-        """Name a distant source found from shadows: a sun outdoors, else as a photographed source within 20 degrees."""
+        """Name a distant source found from shadows.
+
+        Outdoors it is the sun. In a room it has the name of a photographed source within 20 degrees, or else its
+        possible kinds.
+        """
         if self.evidence.is_outdoors:
             return "sun"
         near = (s for s in self.mean.sources if float(torch.tensor(s.direction) @ direction.float()) > 0.94)
@@ -264,8 +268,9 @@ def _source(
     if visible > 0:
         size = max(visible, 0.1) * SOLID_ANGLE
         distance = _mean_distance(evidence.far.distance[group], weight * shares)
-        in_room = _SEEN_NAMES[float(direction @ evidence.up) > _LAMP]
-        name = "sun" if distance >= 0.5 * FARTHEST else _SEEN_OUTDOORS if evidence.is_outdoors else in_room
+        name = _SEEN_OUTDOORS if evidence.is_outdoors else _SEEN_NAMES[float(direction @ evidence.up) > _LAMP]
+        if distance >= 0.5 * FARTHEST:
+            name = "sun"
         # a small patch may show the sun through a window; a large one has the distance of the panorama
         distance = math.inf if size < _SUN else distance
         # the middle of a clipped patch is about 2 degrees off

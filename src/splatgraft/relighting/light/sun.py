@@ -66,14 +66,14 @@ _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chose
 SURFACES = 2  # level surfaces whose shadows move a sun: a table, and the ground around it
 _STEP_DEG = 2.5  # of the grids of directions around a given one
 _IMPROBABLE = 4.5  # difference of log densities to the most probable direction, as at 3 standard errors
-_WIDER = 3.0  # radius of the second region: few things stand near a small object, but the sun is the same
+_WIDER = 3.0  # radius of the region of `sun_near` over the given one: few things stand near a small object
 _TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a prior, because texels share their errors
 _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
 _MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
 _RADII_DEG, _CONE = (0.3, 1.0, 2.0, 4.0, 8.0), 12  # angular radii that are tried, and directions that sample each
 _MAX_TINT = 0.85
-"""Largest absolute log of a channel's ratio over that of luminance. Nine measured suns of rendered scenes have up to
-.87, most .5; the contrast of photographs of a lawn makes it 1.66."""
+"""Largest absolute log of a channel's ratio over that of luminance. Nine suns measured on rendered scenes have .04 to
+.87; one measured on photographs of a lawn has 1.66, because their contrast makes shade bluer."""
 UNSEEN_RADIUS_DEG = 1.0  # angular radius of a source that neither a camera nor an edge of a shadow shows
 _LIKELIER = 3.0  # difference of log likelihoods, 20 to 1, for a larger radius, and for the strength near a known sun
 ERROR_DEG = 1.0  # standard error of a direction that was found; minimum for others
@@ -476,7 +476,7 @@ def sun_near(
 ) -> Sun:
     """Find the direction of a sun that is known to exist, from shadows that may be too faint to prove a sun.
 
-    The log likelihoods of the shadows on the largest level surfaces in the wider region are added to a given density.
+    The log likelihoods of the shadows on the largest level surfaces in a wider region are added to a given density.
 
     Args:
         directions: Unit directions in which the sun may stand.
