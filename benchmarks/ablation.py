@@ -74,7 +74,10 @@ _EVIDENCE = tuple(
 )
 _RADIANCE, _SUN = ("relighting.light.estimate.search_radiance",), ("relighting.light.estimate.find_sun",)
 _LIGHT = ("relighting.scene_light.estimate_light", "relighting.prepared_object.estimate_light")
-_PLACE, _OBJECT = (*_LIGHT, "relighting.transfer.find_scene_light"), ("relighting.transfer.prepare_object",)
+_PLACE, _OBJECT = (
+    (*_LIGHT, "relighting.transfer.find_scene_light"),
+    tuple(f"relighting.transfer.{name}" for name in ("capture_object", "prepare_object")),
+)
 _SHADOWS = ("relighting.transfer.cast_shadows",)
 
 STAGES: Mapping[str, tuple[str, ...]] = {

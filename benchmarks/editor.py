@@ -159,7 +159,7 @@ def drag(client: Client, found: dict[str, float], name: str) -> None:
     found[f"{name}drag, pictures a second"] = moved(client, lambda seconds: at("move", seconds))
     at("up", SECONDS)
     count, begin = len(client.heads), time.monotonic()
-    client.until(lambda head: "draft" in head["caption"] or "nearly" in head["caption"] or is_final(head), after=count)
+    client.until(lambda head: "draft" in head["caption"] or is_final(head), after=count)
     found[f"{name}draft after it"] = time.monotonic() - begin
     client.until(is_final, after=count)
     found[f"{name}final after it"] = time.monotonic() - begin

@@ -26,7 +26,7 @@ from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.cast_shadows import cast_shadows
 from splatgraft.relighting.layers import assemble_layers
 from splatgraft.relighting.light.light import fit_ambient
-from splatgraft.relighting.prepared_object import find_source_light, prepare_object
+from splatgraft.relighting.prepared_object import capture_object, find_source_light, prepare_object
 from splatgraft.relighting.scene_light import SceneLight, find_scene_light
 
 COUNTS, OCCLUDERS, ORIGIN, REPEATS = (100_000, 300_000, 1_000_000), 50_000, 20_000, 3
@@ -87,8 +87,8 @@ def measure(count: int, *, repeats: int, clock: Callable[[], float] = time.perf_
     spheres = [bounding_sphere(composite.objects[0].in_target())]
     there = find_scene_light(CapturedScene(scene, cameras), spheres, light=light, reach=options.reach)
     assert isinstance(there, SceneLight)
-    old = find_source_light(ball, origin)
-    prepared = prepare_object(composite.objects[0], origin, cameras, source_light=old, light=there.light, number=1)
+    captured = capture_object(ball, origin, cameras, source_light=find_source_light(ball, origin))
+    prepared = prepare_object(composite.objects[0], captured, there.light, number=1)
 
     def move_seconds(shift: float, views: int) -> float:
         start = clock()

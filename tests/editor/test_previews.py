@@ -151,13 +151,10 @@ def test_the_previewed_light_equals_the_step_s_result(session: Session, light: L
 def test_the_light_after_a_move_equals_the_step_s_result(session: Session) -> None:
     relighting, first = RelitPreview(session.scenes), session.placed_state()
     relighting.relit(first)
-    assert relighting.refined(first) is None
     session.change(moved(first))
     relighting.draft(session.state)
     # drafts keep the sources of the light, which were estimated at another place
-    assert relighting.refined(session.state) is not None
     relit = relighting.relit(session.state)
-    assert relighting.refined(session.state) is None
     assert main(["run", str(session.files.file), "--to", "relight"]) == 0
     assert torch.equal(read_gaussians(session.files.relit).sh, relit.bake(session.state.weights)[0].sh)
 

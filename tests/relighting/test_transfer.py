@@ -32,7 +32,7 @@ from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.cast_shadows import SHADOW_POWER, cast_shadows
 from splatgraft.relighting.layers import assemble_layers
 from splatgraft.relighting.light.light import fit_ambient
-from splatgraft.relighting.prepared_object import prepare_object
+from splatgraft.relighting.prepared_object import capture_object, prepare_object
 from splatgraft.relighting.scene_light import SceneLight, find_scene_light
 from splatgraft.relighting.shading import ShadeSettings, shade_ratio
 
@@ -258,7 +258,9 @@ def test_values_that_moved_with_the_object_give_what_new_ones_do():
     assert there.receivers is first.receivers
     assert first.moved(spheres(3.0)) is None
     old, new = (PlacedObject(body, at(x, 0.0, 0.35)) for x in (0.0, 0.2))
-    prepared = prepare_object(old, None, cameras(), source_light=None, light=first.light, number=1)
+    seen_from = old.target_from_object.inverse().cameras(cameras())
+    captured = capture_object(body, None, seen_from, source_light=None)
+    prepared = prepare_object(old, captured, first.light, number=1)
     moved = prepared.moved(new, there.light)
     assert moved is not None
     assert prepared.moved(replace(new, target_from_object=at(0.2, 0.0, 0.35, rotation=QUARTER)), there.light) is None

@@ -262,7 +262,7 @@ class Editor:
             parts.append(pictures.draw(kind, state, part))
         caption = "full quality"
         if self.kind == "lit" and state.objects:
-            words = {"": "old light: computing", "draft": "draft of the light", "refined": "light: nearly done"}
+            words = {"": "old light: computing", "draft": "draft of the light"}
             caption = words.get(pictures.lit.stage(state), caption)
             caption = caption if session.files.transfers_light else "light transfer off"
         return parts[0] if len(parts) == 1 else np.concatenate(parts, 1), caption

@@ -25,8 +25,8 @@ from splatgraft.editor.state import EditState, stamps_of
 from splatgraft.editor.worker import LatestOnlyWorker
 from splatgraft.relighting import Relit
 
-Stage = Literal["draft", "refined", "final"]
-"""Draft, all layers with the sources found before a move, or the step's result."""
+Stage = Literal["draft", "final"]
+"""Draft, or the step's result."""
 Wanted = Literal["prepared", "draft", "final"]
 """Kinds of requests: prepare drafts when idle, compute a draft, or compute a draft and the final light."""
 _NICE = 10  # priority below that of pictures, also while modules load
@@ -161,11 +161,6 @@ class _Computing:
     def _light(self, number: int, state: EditState) -> None:
         if not self._lights.wait_idle(_SETTLE_SECONDS) or number != self._number:
             return
-        refined = self._relighting.refined(state)
-        if refined is not None:
-            self._send(number, "refined", _without_evidence(refined))
-            if number != self._number:
-                return
         self._send(number, "final", _without_evidence(self._relighting.relit(state)))
         if self._lights.wait_idle(_SETTLE_SECONDS) and number == self._number:
             self._relighting.prepare_drafts(state)

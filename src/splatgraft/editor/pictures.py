@@ -40,7 +40,7 @@ from splatgraft.segmentation import CUT_SIDE_PX, grabcut_mask, seed_selection
 Kind = Literal["lit", "pasted", "result", "place"]
 TINT = (1.0, 0.45, 0.1)
 """sRGB colour of the selection."""
-_RANKS = {"draft": 0, "refined": 1, "file": 2, "final": 2}  # of stages of the light; a later one is better
+_RANKS = {"draft": 0, "file": 1, "final": 1}  # of stages of the light; a later one is better
 _LONGEST_PX = 1920  # longer side of a photo; the browser enlarges it on a larger canvas
 _DARKEST = 0.5  # largest share of the light that a contact shadow removes
 _SHADOW_WIDTH = 0.35  # width of a contact shadow over the object's radius
@@ -55,7 +55,7 @@ class _LitState:
 
     state: EditState
     stage: str
-    """Stage of the light: `final`, `refined` or `draft`; `file`: the step's result, without layers."""
+    """Stage of the light: `final` or `draft`; `file`: the step's result, without layers."""
     bake: Callable[[LayerWeights], tuple[Gaussians, Bool[Tensor, "b"]]]
     """The scene by the weights of its layers, with flags of the objects."""
     relit: Relit | None = None

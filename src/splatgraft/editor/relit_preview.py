@@ -105,25 +105,8 @@ class RelitPreview:
 
     def relit(self, state: EditState) -> Relit:
         """Compute the layers of this state's full light transfer, as the step does."""
-
-        def make() -> Relit:
-            # as in the step, sources and shadow maps are those of this placement
-            relit = self._transfer(state, exact=True)
-            self._memo.forget("refined")  # it would be a second copy of a large scene
-            return relit
-
-        return self._make_once("relit", state, make, lock=self._full_lock)
-
-    def refined(self, state: EditState) -> Relit | None:
-        """Compute all layers at full detail after a move, with the light sources estimated before it.
-
-        This takes less time than `relit`. Return None if nothing was moved or these layers exist already.
-        """
-        options, composite = self._scenes.files.relight.options, self._scenes.composite(state)
-        is_moved = self._full_values.is_moved(composite, self._scenes.cameras("target"), state.light, options)
-        if not is_moved or self._memo.peek("refined", self._inputs(state)) is not None:
-            return None
-        return self._make_once("refined", state, lambda: self._transfer(state, exact=False), lock=self._full_lock)
+        # as in the step, sources and shadow maps are those of this placement
+        return self._make_once("relit", state, lambda: self._transfer(state), lock=self._full_lock)
 
     def draft(self, state: EditState) -> Draft:
         """Compute a draft with coarse shadow edges; the first draft omits the light of the source scene."""
@@ -153,14 +136,14 @@ class RelitPreview:
     def _inputs(self, state: EditState) -> tuple[Any, ...]:
         return (self._scenes.composite(state), state.light, repr(self._scenes.files.relight.options))
 
-    def _transfer(self, state: EditState, *, exact: bool) -> Relit:
+    def _transfer(self, state: EditState) -> Relit:
         return self._full_values.relight(
             self._scenes.composite(state),
             self._scenes.cameras("target"),
             sources=self._scenes.source_scenes(state),
             light=state.light,
             options=self._scenes.files.relight.options,
-            exact=exact,
+            exact=True,
         )
 
     def _draft(self, state: EditState, *, with_sources: bool = False) -> Draft:

@@ -1,8 +1,9 @@
 """Preparation of a placed object for the light at its new place.
 
 1. Find the light in the object's capture (`find_source_light`).
-2. Estimate normals, splat shadow maps, and compute self-visibility and materials (`prepare_object`).
-3. Move the results with the object (`PreparedObject.moved`). They are computed again after a rotation, a change of
+2. Estimate normals and materials in the object's own frame (`capture_object`). They do not depend on the placement.
+3. Place the object: turn these values, splat shadow maps, and compute self-visibility (`prepare_object`).
+4. Move the results with the object (`PreparedObject.moved`). They are computed again after a rotation, a change of
    scale, or a change of the light sources.
 """
 
@@ -62,13 +63,38 @@ class SourceLighting:
     """The light that an object of n Gaussians was captured in."""
 
     light: Light
-    """The light, target's frame."""
+    """The light, in the frame of the object that it belongs to."""
     irradiance: Float[Tensor, "n 3"]
     """Linear rgb irradiance on each Gaussian under that light."""
     materials: Materials
     """Matt and glossy parts of the object's colours, in units of that light."""
     estimate: EstimatedLight | None
     """Evidence for the light, source's frame; None if the light was given."""
+
+
+@dataclass(frozen=True)
+class CapturedObject:
+    """An object of n Gaussians as its capture shows it, in its own frame."""
+
+    gaussians: Gaussians
+    """The object."""
+    normals: Normals
+    """Normals of the Gaussians."""
+    lighting: SourceLighting | None
+    """Old light of the object; None if it is unknown."""
+    described: str
+    """Description of the old light, or the reason why it is unknown; empty without a source scene."""
+
+    def notes(self, number: int) -> tuple[Note, ...]:
+        """Describe the old light and the materials of the object of this number."""
+        place = f"At the old place of object {number}: {self.described}"
+        if self.lighting is None:
+            unknown = f"The old light of object {number} is unknown: the object keeps its mean brightness."
+            return (*([Note(place)] if self.described else []), Note(unknown, "warning"))
+        gloss = _gloss_note(self.lighting.materials, self.gaussians)
+        if isinstance(self.gaussians, KnownSurface):
+            return (Note(f"Object {number} is a mesh: its shape and material are known.{gloss}"),)
+        return (Note(place + gloss),)
 
 
 @dataclass(frozen=True)
@@ -138,61 +164,58 @@ def find_source_light(object_gaussians: Gaussians, source: SourceScene | None) -
     return estimate_light(captured, bounding_sphere(object_gaussians), object_gaussians=object_gaussians)
 
 
-def prepare_object(
-    placed: PlacedObject,
-    source: SourceScene | None,
-    cameras: Cameras,
-    *,
-    source_light: SourceLight,
-    light: Light,
-    number: int,
-) -> PreparedObject:
-    """Prepare one object for the light at its new place.
+def capture_object(
+    gaussians: Gaussians, source: SourceScene | None, cameras: Cameras, *, source_light: SourceLight
+) -> CapturedObject:
+    """Find an object's normals and materials, and the irradiance on it in its capture.
 
     Args:
-        placed: Object and placement.
-        source: The scene that the object was taken from; None if unknown.
-        cameras: Cameras of the target's capture.
+        gaussians: The object, own frame.
+        source: The scene that it was taken from; None if unknown.
+        cameras: Cameras that see the object, own frame: those of its capture, which see it best, if they are known.
         source_light: Result of `find_source_light`.
-        light: The light at the new place.
-        number: Number of the object among all placed ones, from 1.
 
     Raises:
         ValueError: The source gives another number of normals than the object has Gaussians.
     """
-    gaussians = placed.in_target()
-    sphere = bounding_sphere(gaussians)
-    # the capture's own cameras see the object best
-    seen_from = cameras if source is None else placed.target_from_object.cameras(source.cameras)
-    is_known = isinstance(gaussians, KnownSurface)
-    views = () if is_known else object_views(gaussians, sphere, seen_from)
-    normals = _known(gaussians.normals) if is_known else _normals(placed, source, gaussians, seen_from, views)
-    samples, lighting, notes = sample_light(light), None, []
-    estimate = source_light if isinstance(source_light, EstimatedLight) else None
     old = source_light.light if isinstance(source_light, EstimatedLight) else source_light
-    if is_known and isinstance(old, Light):
-        (visible,) = self_visibility(gaussians, sphere, normals.vectors, (samples,))
+    if isinstance(gaussians, KnownSurface):
+        assert isinstance(old, Light)
         received = torch.full((gaussians.count, 3), math.pi)  # of white light
         lighting = SourceLighting(old, received, known_materials(gaussians), None)
-        gloss = _gloss_note(lighting.materials, gaussians)
-        notes.append(Note(f"Object {number} is a mesh: its shape and material are known.{gloss}"))
-    elif isinstance(old, Light) and source is not None:
-        turned = old.rotated(placed.target_from_object.rotation)
-        old_samples = sample_light(turned)
-        visible, shares = self_visibility(gaussians, sphere, normals.vectors, (samples, old_samples))
-        received = irradiance(old_samples, normals.vectors, sample_visibility=shares)
-        materials = estimate_materials(gaussians, normals.vectors, views, reflected_light(turned, old_samples, shares))
-        lighting = SourceLighting(turned, received, materials, estimate)
-        described = describe_light(old, estimate_up(source.cameras)) + ("." if estimate is not None else ", as given.")
-        notes.append(Note(f"At the old place of object {number}: {described}{_gloss_note(materials, gaussians)}"))
-    else:
-        (visible,) = self_visibility(gaussians, sphere, normals.vectors, (samples,))
-        if isinstance(old, NoLight):
-            notes.append(Note(f"At the old place of object {number}: {old.reason}"))
-        unknown = f"The old light of object {number} is unknown: the object keeps its mean brightness."
-        notes.append(Note(unknown, "warning"))
+        return CapturedObject(gaussians, _known(gaussians.normals), lighting, "")
+    sphere = bounding_sphere(gaussians)
+    views = object_views(gaussians, sphere, cameras)
+    normals = _normals(gaussians, source, cameras, views)
+    if source is None or not isinstance(old, Light):
+        reason = old.reason if isinstance(old, NoLight) else ""
+        return CapturedObject(gaussians, normals, None, reason)
+    samples = sample_light(old)
+    (visible,) = self_visibility(gaussians, sphere, normals.vectors, (samples,))
     received = irradiance(samples, normals.vectors, sample_visibility=visible)
-    radiance = _albedo(gaussians, lighting) * received / math.pi
+    materials = estimate_materials(gaussians, normals.vectors, views, reflected_light(old, samples, visible))
+    estimate = source_light if isinstance(source_light, EstimatedLight) else None
+    described = describe_light(old, estimate_up(source.cameras)) + ("." if estimate is not None else ", as given.")
+    return CapturedObject(gaussians, normals, SourceLighting(old, received, materials, estimate), described)
+
+
+def prepare_object(placed: PlacedObject, captured: CapturedObject, light: Light, *, number: int) -> PreparedObject:
+    """Prepare one object for the light at its new place.
+
+    Args:
+        placed: Object and placement.
+        captured: The object in its own frame.
+        light: The light at the new place.
+        number: Number of the object among all placed ones, from 1.
+    """
+    gaussians, turned = placed.in_target(), placed.target_from_object.rotation
+    sphere, samples = bounding_sphere(gaussians), sample_light(light)
+    normals = replace(captured.normals, vectors=captured.normals.vectors @ turned.to(captured.normals.vectors).T)
+    lighting = captured.lighting
+    if lighting is not None:
+        lighting = replace(lighting, light=lighting.light.rotated(turned))
+    (visible,) = self_visibility(gaussians, sphere, normals.vectors, (samples,))
+    radiance = _albedo(gaussians, lighting) * irradiance(samples, normals.vectors, sample_visibility=visible) / math.pi
     return PreparedObject(
         number=number,
         gaussians=gaussians,
@@ -203,7 +226,7 @@ def prepare_object(
         maps=object_shadow_maps(gaussians, sphere, samples, radiance=radiance),
         self_visibility=visible,
         source_lighting=lighting,
-        notes=tuple(notes),
+        notes=captured.notes(number),
     )
 
 
@@ -227,19 +250,14 @@ def _gloss_note(materials: Materials, gaussians: Gaussians) -> str:
 
 
 def _normals(
-    placed: PlacedObject,
-    source: SourceScene | None,
-    in_target: Gaussians,
-    cameras: Cameras,
-    views: tuple[ObjectView, ...],
+    gaussians: Gaussians, source: SourceScene | None, cameras: Cameras, views: tuple[ObjectView, ...]
 ) -> Normals:
-    """Return the object's normals in the target's frame: the source's, or an estimate."""
+    """Return the object's normals: the source's, or an estimate."""
     if source is None or source.normals is None:
-        neighbours = estimate_normals(in_target, cameras)
-        return fuse_normals(in_target, views, neighbours)
-    if len(source.normals) != in_target.count:
-        raise ValueError(f"relight: expected {in_target.count} normals, found {len(source.normals)}")
-    return _known(source.normals @ placed.target_from_object.rotation.to(source.normals).T)
+        return fuse_normals(gaussians, views, estimate_normals(gaussians, cameras))
+    if len(source.normals) != gaussians.count:
+        raise ValueError(f"relight: expected {gaussians.count} normals, found {len(source.normals)}")
+    return _known(source.normals)
 
 
 def _known(normals: Float[Tensor, "n 3"]) -> Normals:

@@ -4,7 +4,7 @@ Differential rendering (Debevec 1998) on Gaussians, without training: the light 
 estimated, and colours are multiplied by ratios of irradiance. Each step is one call and makes one value:
 
 1. `find_scene_light`: the light of the target at the objects' place.
-2. `prepare_object`: each object's normals, materials and old light.
+2. `capture_object` and `prepare_object`: each object's normals, materials and old light, in its own frame, then placed.
 3. `cast_shadows`: the shadows and the bounce of the objects.
 4. `assemble_layers`: the composite with its change of light in layers.
 
@@ -29,9 +29,11 @@ from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.panorama import NoLight
 from splatgraft.relighting.light.sun import Point
 from splatgraft.relighting.prepared_object import (
+    CapturedObject,
     PreparedObject,
     SourceLight,
     SourceScene,
+    capture_object,
     find_source_light,
     prepare_object,
 )
@@ -109,11 +111,8 @@ class TransferValues:
         self._memo, self._clock = Memo(), clock
         self._source_lights: dict[tuple[int, int], tuple[_Captured, SourceLight]] = {}
         """Light at each object's old place, by the identities of the object and its source scene."""
-
-    def is_moved(self, composite: Composite, cameras: Cameras, light: Light | None, options: RelightOptions) -> bool:
-        """Return whether objects were moved since the light of the scene was found."""
-        kept = self._memo.peek(_kind(light), _light_inputs(composite, cameras, light, options))
-        return kept is not None and kept[0] != _poses(composite)
+        self._captured: dict[tuple[int, int], tuple[_Captured, CapturedObject]] = {}
+        """Each object as its capture shows it, in the same way."""
 
     def relight(
         self,
@@ -130,6 +129,7 @@ class TransferValues:
         placed = [(number, one, source) for number, (one, source) in pairs if one.gaussians.count]
         used = {_identity((one.gaussians, source)) for _, one, source in placed}
         self._source_lights = {key: known for key, known in self._source_lights.items() if key in used}
+        self._captured = {key: known for key, known in self._captured.items() if key in used}
         if not placed:
             return pasted(composite, "No object is placed: nothing to light.")
         scene = self._scene_light(composite, cameras, light, options, exact=exact)
@@ -190,16 +190,25 @@ class TransferValues:
             moved = kept.moved(placed, scene.light)
             if moved is not None:
                 return moved
-        pair = (placed.gaussians, source)
-        key = _identity(pair)
-        if key not in self._source_lights:  # copies of one object were captured in one light
-            self._source_lights[key] = (pair, find_source_light(*pair))
-        source_light = self._source_lights[key][1]
-        prepared = prepare_object(
-            placed, source, scene.captured.cameras, source_light=source_light, light=scene.light, number=number
-        )
+        captured = self._captured_object(placed, source, scene.captured.cameras)
+        prepared = prepare_object(placed, captured, scene.light, number=number)
         self._memo.put(name, inputs, prepared)
         return prepared
+
+    def _captured_object(self, placed: PlacedObject, source: SourceScene | None, cameras: Cameras) -> CapturedObject:
+        pair = (placed.gaussians, source)
+        key = _identity(pair)
+        if key in self._captured:  # copies of one object were captured in one light
+            return self._captured[key][1]
+        if key not in self._source_lights:
+            self._source_lights[key] = (pair, find_source_light(*pair))
+        light = self._source_lights[key][1]
+        if source is None:  # the target's cameras see the object, and so the result depends on its placement
+            seen_from = placed.target_from_object.inverse().cameras(cameras)
+            return capture_object(placed.gaussians, None, seen_from, source_light=light)
+        captured = capture_object(placed.gaussians, source, source.cameras, source_light=light)
+        self._captured[key] = (pair, captured)
+        return captured
 
 
 def _identity(pair: _Captured) -> tuple[int, int]:
