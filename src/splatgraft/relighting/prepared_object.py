@@ -4,7 +4,7 @@
 2. Estimate normals and materials in the object's own frame (`capture_object`). They do not depend on the placement.
 3. Place the object: turn these values, splat shadow maps, and compute self-visibility (`prepare_object`).
 4. Move the results with the object (`PreparedObject.moved`). They are computed again after a rotation, a change of
-   scale, or a change of the light sources.
+   scale, or a change of the sources' directions.
 """
 
 import math
@@ -26,9 +26,9 @@ from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
-from splatgraft.relighting.light.light import Light, LightSource, fit_ambient
+from splatgraft.relighting.light.light import Light, fit_ambient
 from splatgraft.relighting.light.panorama import NoLight
-from splatgraft.relighting.light.samples import sample_light
+from splatgraft.relighting.light.samples import LightSamples, sample_light
 from splatgraft.relighting.materials import Materials, estimate_materials, known_materials, reflected_light
 from splatgraft.relighting.normals import Normals, estimate_normals
 from splatgraft.relighting.object_views import ObjectView, fuse_normals, object_views
@@ -111,8 +111,8 @@ class PreparedObject:
     """Bounding sphere of the Gaussians."""
     normals: Normals
     """Normals of the Gaussians."""
-    light_sources: tuple[LightSource, ...]
-    """Sources of the light at the new place."""
+    light: Light
+    """The light that the object was prepared for."""
     maps: ObjectShadowMaps
     """Shadow maps for the samples of the light at the new place."""
     self_visibility: Float[Tensor, "n k"]
@@ -122,19 +122,32 @@ class PreparedObject:
     notes: tuple[Note, ...]
     """Description of the old light, or the reason why it is unknown."""
 
+    def is_for(self, placed: PlacedObject, light: Light) -> bool:
+        """Return whether the object was prepared for this placement and this light."""
+        same_light = light.sources == self.light.sources and torch.equal(light.ambient, self.light.ambient)
+        old, new = self.target_from_object, placed.target_from_object
+        return same_light and self._is_turned_as(placed) and torch.equal(new.translation, old.translation)
+
+    def _is_turned_as(self, placed: PlacedObject) -> bool:
+        old, new = self.target_from_object, placed.target_from_object
+        return new.scale == old.scale and torch.equal(new.rotation, old.rotation)
+
     def moved(self, placed: PlacedObject, light: Light) -> "PreparedObject | None":
-        """Translate the object to the place in `placed`, under other ambient light.
+        """Translate the object to the place in `placed`, under a light from the same directions.
+
+        The bounce keeps the colours of the light that the object was prepared for.
 
         Returns:
-            The moved object; None if it was rotated or scaled, too, or if the light has other sources.
+            The moved object; None if it was rotated or scaled, too, or if the light has other directions.
         """
-        old, new = self.target_from_object, placed.target_from_object
-        if light.sources != self.light_sources or new.scale != old.scale or not torch.equal(new.rotation, old.rotation):
-            return None
-        center = self.sphere.center + (new.translation - old.translation).to(self.sphere.center)
-        sphere = BoundingSphere(center, self.sphere.radius)
         samples = sample_light(light)
         parts = [part for part in (samples.of_sources, samples.of_ambient) if len(part)]
+        known = [part for part, _, _ in self.maps.occlusions]
+        if not self._is_turned_as(placed) or len(parts) != len(known) or not all(map(_are_alike, parts, known)):
+            return None
+        new, old = placed.target_from_object, self.target_from_object
+        center = self.sphere.center + (new.translation - old.translation).to(self.sphere.center)
+        sphere = BoundingSphere(center, self.sphere.radius)
         occlusions = tuple(
             (part, replace(occlusion, center=center), bias)
             for part, (_, occlusion, bias) in zip(parts, self.maps.occlusions, strict=True)
@@ -146,6 +159,12 @@ class PreparedObject:
             sphere=sphere,
             maps=ObjectShadowMaps(sphere, occlusions),
         )
+
+
+def _are_alike(one: LightSamples, other: LightSamples) -> bool:
+    """Return whether the shadow maps of one light's samples are those of another's."""
+    pairs = ((one.directions, other.directions), (one.distances, other.distances))
+    return all(torch.equal(a, b) for a, b in pairs)
 
 
 def find_source_light(object_gaussians: Gaussians, source: SourceScene | None) -> SourceLight:
@@ -222,7 +241,7 @@ def prepare_object(placed: PlacedObject, captured: CapturedObject, light: Light,
         target_from_object=placed.target_from_object,
         sphere=sphere,
         normals=normals,
-        light_sources=light.sources,
+        light=light,
         maps=object_shadow_maps(gaussians, sphere, samples, radiance=radiance),
         self_visibility=visible,
         source_lighting=lighting,

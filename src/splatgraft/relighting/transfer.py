@@ -185,11 +185,11 @@ class TransferValues:
     ) -> PreparedObject:
         name, inputs = f"object {number}", (placed.gaussians, source, scene.captured.cameras)
         kept: PreparedObject | None = self._memo.peek(name, inputs)
-        place = placed.target_from_object.translation
-        if kept is not None and not (exact and not torch.equal(kept.target_from_object.translation, place)):
-            moved = kept.moved(placed, scene.light)
-            if moved is not None:
-                return moved
+        if kept is not None and kept.is_for(placed, scene.light):
+            return kept
+        moved = None if kept is None or exact else kept.moved(placed, scene.light)
+        if moved is not None:
+            return moved
         captured = self._captured_object(placed, source, scene.captured.cameras)
         prepared = prepare_object(placed, captured, scene.light, number=number)
         self._memo.put(name, inputs, prepared)

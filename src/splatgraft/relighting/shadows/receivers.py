@@ -2,8 +2,8 @@
 
 A Gaussian has one colour, so a Gaussian wider than a shadow's edge cannot show it. `shade_receivers` repeats:
 
-1. Compute the ratio at the centre of each Gaussian, and its variation along each axis (`_varying_ratio`).
-2. Split the Gaussians with the largest variation along that axis, while the budget lasts.
+1. Compute the ratio at the centre of each Gaussian.
+2. While the budget lasts, split the Gaussians with the largest variation along an axis (`_worst_axis`).
 
 A plain surface is a layer of Gaussians whose centres lie above and below it. The layer's middle (`layer_middle`) is the
 surface. Visibility is tested above its top (`layer_height`), because upper Gaussians would shadow lower ones (acne).
@@ -83,12 +83,13 @@ def shade_receivers(
     pending, which = receivers, torch.arange(len(receivers.origin))
     ambient = _sums(pending, maps, sources=False)
     for round_ in range(_MAX_SPLITS + 1):
-        ratio, variation = _varying_ratio(pending, maps, ambient)
-        axis = variation.argmax(1)
-        wanted = variation.max(1).values
-        wanted = torch.where((wanted > _VARIATION) & (pending.gaussians.opacities > _FAINTEST), wanted, 0)
-        room = budget // (PIECES - 1)
-        if round_ == _MAX_SPLITS or room == 0 or not bool((wanted > 0).any()):
+        by_sources = _sums(pending, maps, sources=True)
+        ratio, room = ratio_from_sums(by_sources + ambient), budget // (PIECES - 1)
+        if round_ == _MAX_SPLITS or room == 0:
+            done.append((pending, which, ratio, ambient))
+            break
+        axis, wanted = _worst_axis(pending, maps, (by_sources, ambient), ratio)
+        if not bool((wanted > 0).any()):
             done.append((pending, which, ratio, ambient))
             break
         order = wanted.argsort(descending=True)[: min(room, int((wanted > 0).sum()))]
@@ -123,26 +124,34 @@ def _broad(gaussians: Gaussians, maps: ObjectShadowMaps) -> Bool[Tensor, "m"]:
     return gaussians.scales.max(1).values > _BROAD * maps.sphere.radius
 
 
-def _varying_ratio(
-    receivers: Receivers, maps: ObjectShadowMaps, ambient: Float[Tensor, "3 m 3"]
-) -> tuple[SceneRatio, Float[Tensor, "m 3"]]:
-    """Compute the ratio at each Gaussian's centre, and its visible variation along each own axis.
+def _worst_axis(
+    receivers: Receivers,
+    maps: ObjectShadowMaps,
+    center_sums: tuple[Float[Tensor, "3 m 3"], Float[Tensor, "3 m 3"]],
+    ratio: SceneRatio,
+) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
+    """Find the axis along which each Gaussian's shadow varies most visibly, and that variation; 0 if it is too small.
 
     Variation at a point is weighted by the Gaussian's alpha there. It is 0 along axes too narrow to split.
+
+    Args:
+        receivers: The m Gaussians.
+        maps: The object's shadow maps.
+        center_sums: Light sums at their centres by the sources, and by the ambient light.
+        ratio: Ratios at their centres.
     """
-    g = receivers.gaussians
-    by_sources = _sums(receivers, maps, sources=True)
-    ratio, variation = ratio_from_sums(by_sources + ambient), torch.zeros(g.count, 3)
+    g, (by_sources, ambient) = receivers.gaussians, center_sums
+    variation = torch.zeros(g.count, 3)
     smallest = _FINEST * maps.sphere.radius / math.sqrt(PIECE_WIDTH)
     broad = _broad(g, maps)
     fine = ((g.scales.max(1).values > smallest) & ~broad).nonzero()[:, 0]
-    lit = bool(by_sources.any())
-    fine = _at_an_edge(receivers, maps, fine, (by_sources, ambient)) if lit else fine[:0]
+    fine = _at_an_edge(receivers, maps, fine, center_sums) if bool(by_sources.any()) else fine[:0]
     for which, constant in ((fine, ambient[:, fine]), (broad.nonzero()[:, 0], None)):
         if len(which):
             moves = _variation(receivers.select(which), maps, ratio.shadow[which], ambient=constant)
             variation = variation.index_copy(0, which, moves)
-    return ratio, torch.where(g.scales < smallest, 0, variation)
+    most, axis = torch.where(g.scales < smallest, 0, variation).max(1)
+    return axis, torch.where((most > _VARIATION) & (g.opacities > _FAINTEST), most, 0)
 
 
 def _sums(receivers: Receivers, maps: ObjectShadowMaps, *, sources: bool, points: Tensor | None = None) -> Tensor:
