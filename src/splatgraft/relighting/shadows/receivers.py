@@ -146,9 +146,10 @@ def _worst_axis(
     broad = _broad(g, maps)
     fine = ((g.scales.max(1).values > smallest) & ~broad).nonzero()[:, 0]
     fine = _at_an_edge(receivers, maps, fine, center_sums) if bool(by_sources.any()) else fine[:0]
-    for which, constant in ((fine, ambient[:, fine]), (broad.nonzero()[:, 0], None)):
+    for which, is_broad in ((fine, False), (broad.nonzero()[:, 0], True)):
         if len(which):
-            moves = _variation(receivers.select(which), maps, ratio.shadow[which], ambient=constant)
+            part, shadow = receivers.select(which), ratio.shadow[which]
+            moves = _variation(part, maps, shadow, ambient[:, which], broad=is_broad)
             variation = variation.index_copy(0, which, moves)
     most, axis = torch.where(g.scales < smallest, 0, variation).max(1)
     return axis, torch.where((most > _VARIATION) & (g.opacities > _FAINTEST), most, 0)
@@ -185,28 +186,27 @@ def _variation(
     receivers: Receivers,
     maps: ObjectShadowMaps,
     centers: Float[Tensor, "f 3"],
+    ambient: Float[Tensor, "3 f 3"],
     *,
-    ambient: Float[Tensor, "3 f 3"] | None,
+    broad: bool,
 ) -> Float[Tensor, "f 3"]:
     """Measure the variation of the shadow along each axis of f Gaussians, from points along both wide axes.
-
-    If `ambient` is None, ambient light is sampled too, and points along the diagonals are added. Otherwise it is
-    constant over each Gaussian.
 
     Args:
         receivers: The f Gaussians.
         maps: The object's shadow maps.
         centers: Shadow at their centres.
-        ambient: The ambient part of the light sums.
+        ambient: The ambient part of the light sums at their centres.
+        broad: Whether ambient light varies over each Gaussian; points along the diagonals are then added.
     """
-    g, lines, line = receivers.gaussians, 2 if ambient is not None else 4, RIM * torch.tensor([-1, -0.5, 0, 0.5, 1])
+    g, lines, line = receivers.gaussians, 4 if broad else 2, RIM * torch.tensor([-1, -0.5, 0, 0.5, 1])
     beside = line[line != 0]
-    points = _points(g, (_LINES[:lines, :, None] * beside).transpose(0, 1).flatten(1))
-    sums = _sums(receivers, maps, sources=True, points=points)
-    if ambient is None:
-        sums = sums + _sums(receivers, maps, sources=False, points=points)
+    offsets = (_LINES[:lines, :, None] * beside).transpose(0, 1).flatten(1)
+    sums = _sums(receivers, maps, sources=True, points=_points(g, offsets))
+    if broad:
+        sums = sums + _ambient_at(receivers, maps, ambient, offsets).flatten(1, 2)
     else:
-        sums = sums + ambient.repeat_interleave(lines * len(beside), 1)
+        sums = sums + ambient.repeat_interleave(offsets.shape[1], 1)
     there = ratio_from_sums(sums).shadow.reshape(g.count, lines, len(beside), 3)
     half, here = len(beside) // 2, centers[:, None, None].expand(-1, lines, 1, 3)
     shadow = torch.cat([there[:, :, :half], here, there[:, :, half:]], 2)
@@ -217,6 +217,19 @@ def _variation(
         moves = torch.maximum(moves[:, :2], 0.5 * moves[:, 2:].amax(1, keepdim=True))
     wide_axes = g.scales.argsort(1, descending=True)[:, :2]
     return torch.zeros(g.count, 3).scatter(1, wide_axes, moves)
+
+
+def _ambient_at(
+    receivers: Receivers, maps: ObjectShadowMaps, ambient: Float[Tensor, "3 f 3"], offsets: Float[Tensor, "2 p"]
+) -> Float[Tensor, "3 f p 3"]:
+    """Compute the ambient light sums at offsets, by parabolas through the centre and two points on each wide axis."""
+    step = 0.5 * RIM
+    points = _points(receivers.gaussians, torch.tensor([[step, -step, 0.0, 0.0], [0.0, 0.0, step, -step]]))
+    sums = _sums(receivers, maps, sources=False, points=points).reshape(3, len(points), 2, 2, 3)
+    ahead, behind, here = sums[..., 0, :], sums[..., 1, :], ambient[:, :, None]
+    slope, curvature = (ahead - behind) / (2 * step), (ahead + behind - 2 * here) / (2 * step**2)
+    moved = torch.einsum("sfac,ap->sfpc", slope, offsets) + torch.einsum("sfac,ap->sfpc", curvature, offsets**2)
+    return (here + moved).clamp_min(0)
 
 
 def _points(gaussians: Gaussians, offsets: Float[Tensor, "2 p"]) -> Float[Tensor, "n p 3"]:
