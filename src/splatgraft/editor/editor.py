@@ -447,6 +447,8 @@ class Editor:
             is_move = message["t"] == "pointer" and message["what"] == "move"
             if is_move:
                 message, self._moves = self._moves or message, None
+                if self.live is not None and not self._actions.empty():
+                    continue  # the release of a drag has its own place
             with self.lock:
                 view = self.editing()
                 if view is not None and view.window is window:
