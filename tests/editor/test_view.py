@@ -27,6 +27,7 @@ from splatgraft.editor.light_panel import SkyDome, with_direction
 from splatgraft.editor.orbit import FreeSpace, Orbit, through
 from splatgraft.editor.pictures import draw
 from splatgraft.editor.session import Session
+from splatgraft.editor.stream import View
 from splatgraft.formats import read_gaussians
 from splatgraft.relighting import LightSource
 
@@ -293,3 +294,28 @@ def test_the_divider_shows_the_picture_before_on_its_left(editor: Editor, window
     # JPEG, and its blocks of 16 pixels at the line
     assert np.abs(both[:, :92] - place[:, :92]).mean() < 3
     assert np.abs(both[:, 108:] - whole[:, 108:]).mean() < 3
+
+
+class LeavingView(View):
+    """A view that another thread turns away from its photo once the photo has been asked for."""
+
+    asked = 0
+
+    @property
+    def photo(self) -> int | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        self.asked += 1
+        return 0 if self.asked == 1 else None
+
+    @photo.setter
+    def photo(self, value: int | None) -> None:
+        pass
+
+
+def test_a_view_may_leave_its_photo_while_the_overlay_is_described(editor: Editor, window: Client) -> None:
+    view = editor.editing()
+    assert view is not None
+    window.step("Select")
+    over = editor.panels["Select"].overlay(
+        LeavingView(view.window), editor.require_session().scenes.cameras("source")[0]
+    )
+    assert set(over) == {"dots", "lines"}

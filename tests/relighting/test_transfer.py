@@ -265,6 +265,14 @@ def test_values_that_moved_with_the_object_give_what_new_ones_do():
     assert moved is not None
     assert prepared.moved(replace(new, target_from_object=at(0.2, 0.0, 0.35, rotation=QUARTER)), there.light) is None
     assert prepared.moved(new, sun_from(0, 1, 1)) is None
+    brighter = replace(there.light, sources=(replace(there.light.sources[0], irradiance=(9.0, 8.0, 7.0)),))
+    kept = prepared.moved(new, brighter)
+    assert kept is not None
+    assert kept.maps.occlusions[0][1].texels is prepared.maps.occlusions[0][1].texels
+    assert torch.equal(kept.maps.occlusions[0][0].irradiance, torch.tensor([[9.0, 8.0, 7.0]]))
+    assert prepared.is_for(old, first.light)
+    assert not prepared.is_for(new, first.light)
+    assert not prepared.is_for(old, brighter)
     composite = Composite(scene, (new,), torch.zeros(scene.count, dtype=torch.bool))
     merged, is_object = composite.merged()
     shadows = cast_shadows(there, [moved], merged.select(~is_object), views=cameras().spread(0), budget=0)
@@ -273,6 +281,23 @@ def test_values_that_moved_with_the_object_give_what_new_ones_do():
     # object maps and normals are kept exactly; the scene's maps stay centred at the first place, so that their pixels
     # fall differently on the floor's edge of visibility: a hundredth of the light at most, on average half of that
     assert (found - wanted).abs().mean() < 5e-3
+
+
+def test_an_object_is_examined_once_and_lit_as_new_wherever_it_stands(monkeypatch):
+    examined, examine = [], transfer.capture_object
+    monkeypatch.setattr(transfer, "capture_object", lambda *a, **more: examined.append(a[0]) or examine(*a, **more))
+    body, source, target = ball(), SourceScene(shell(count=500), cameras()), floor(count=40)
+    places = (at(0.0, 0.0, 0.35), at(0.0, 0.0, 0.35, rotation=QUARTER), at(0.3, 0.0, 0.35, rotation=QUARTER))
+    values, light = transfer.TransferValues(lambda: None), sun_from(-1, 0, 1)
+    for place in places:
+        composite = placed((body, place), target=target)
+        given = {"sources": (source,), "light": light, "options": WHOLE}
+        kept = values.relight(composite, cameras(), **given, exact=True)
+        assert len(examined) == 1
+        new = relight(composite, cameras(), **given)
+        examined.pop()
+        assert torch.equal(kept.ratio(), new.ratio())
+        assert torch.equal(kept.gloss, new.gloss)
 
 
 def test_even_lights_change_a_share_of_the_tint_and_of_the_level():

@@ -203,7 +203,8 @@ class Editor:
         """Add the slider that steps through the photos."""
         cameras, view = self.cameras(), self.editing()
         if cameras is not None and len(cameras) > 1 and view is not None:
-            photo = 1 if view.photo is None else view.photo + 1
+            shown = view.photo  # another thread may turn the view away from the photo
+            photo = 1 if shown is None else shown + 1
             hint = "Look from the place of a photo; also by the arrow keys"
             ends, show = (1, len(cameras), 1), lambda value: self.to_photo(int(value) - 1)
             form.slider("photo", "Photo", photo, ends, show, hint=hint)
@@ -427,8 +428,8 @@ class Editor:
         """Move the editing window's view to one of the scene's cameras."""
         cameras, view = self.cameras(), self.editing()
         if cameras is not None and view is not None:
-            view.photo = index % len(cameras)
-            view.orbits[self.side] = through(cameras[view.photo], typical_distance(cameras))
+            index %= len(cameras)
+            view.photo, view.orbits[self.side] = index, through(cameras[index], typical_distance(cameras))
             self.stream.touch(view)
 
     # actions of the editing window, in a thread of their own

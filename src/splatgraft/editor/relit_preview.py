@@ -7,7 +7,6 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -115,9 +114,11 @@ class RelitPreview:
         return self._make_once("draft", state, lambda: self._draft(state), lock=lock)
 
     def prepare_drafts(self, state: EditState) -> None:
-        """Compute the shared values of later drafts once, with the light of the source scene."""
+        """Compute once what the first draft and the first full light after a move share with later ones."""
         composite, sources = self._scenes.composite(state), self._scenes.source_scenes(state)
         if self._scenes.files.transfers_light and (_is_large(composite) or not self._memo.has("relit")):
+            with self._full_lock:
+                self._full_values.examine(composite, self._scenes.cameras("target"), sources)
             with self._draft_lock if _is_large(composite) else self._full_lock:
                 shared = (composite.target, composite.erased, *sources)
                 self._memo.get("drafts prepared", shared, lambda: self._draft(state, with_sources=True))
@@ -165,8 +166,7 @@ class RelitPreview:
             values, parts, coarse = self._draft_values, [target, *objects], target.gaussians
             for i, source in enumerate(sources):
                 if source is not None:
-                    sources[i] = small = memo.get("coarse source", (source,), partial(_coarse_source, source))
-                    pair = (objects[i].gaussians, small)
+                    pair = (objects[i].gaussians, source)
                     values.share_source_light(pair, self._full_values, (given[i], source))
             drawn = Composite(
                 target=coarse,
@@ -185,7 +185,3 @@ class RelitPreview:
 def _is_large(composite: Composite) -> bool:
     objects = [one.gaussians.count for one in composite.objects]
     return composite.kept_count > TARGET_BUDGET or max(objects, default=0) > OBJECT_BUDGET
-
-
-def _coarse_source(source: SourceScene) -> SourceScene:
-    return replace(source, gaussians=coarsen(source.gaussians, TARGET_BUDGET).gaussians)

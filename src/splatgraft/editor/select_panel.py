@@ -104,17 +104,17 @@ class SelectPanel(Panel):
 
     def overlay(self, view: View, camera: Cameras) -> dict[str, Any]:
         """Describe the clicks and their outline in a photo, or the box elsewhere."""
-        session = self.session
-        if view.photo is None:
+        session, photo = self.session, view.photo  # another thread may turn the view away from the photo
+        if photo is None:
             box = session.box()
             return {"dots": [], "lines": []} if box is None else box_over(box, camera, _ORANGE)
-        name = session.scenes.cameras("source").names[view.photo]
-        prompt, (width, height) = prompt_of(session.state.prompts, name), session.pictures.source_photo(view.photo)[1]
+        name = session.scenes.cameras("source").names[photo]
+        prompt, (width, height) = prompt_of(session.state.prompts, name), session.pictures.source_photo(photo)[1]
         shown, dots = PhotoView((width, height), (camera.width, camera.height)), []
         for points, color in ((prompt.inside, _GREEN), (prompt.outside, _RED)):
             at = [shown.place_of(x / width, y / height) for x, y in points.tolist()]
             dots += [{"at": [round(x, 4), round(y, 4)], "color": color} for x, y in at]
-        outline = [[shown.place_of(*point) for point in line] for line in self._outline(view.photo)]
+        outline = [[shown.place_of(*point) for point in line] for line in self._outline(photo)]
         return {"dots": dots, "lines": [{"points": one, "color": _GREEN, "closed": True} for one in outline]}
 
     def _outline(self, photo: int) -> list[list[tuple[float, float]]]:

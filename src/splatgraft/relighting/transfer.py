@@ -141,13 +141,19 @@ class TransferValues:
         shadows = cast_shadows(scene, objects, merged.select(~is_object), views=views, budget=budget)
         return assemble_layers(merged, scene, objects, shadows)
 
+    def examine(self, composite: Composite, cameras: Cameras, sources: Sequence[SourceScene | None]) -> None:
+        """Compute what does not depend on placements: each object with its light at its old place."""
+        for one, source in zip(composite.objects, sources, strict=True):
+            if one.gaussians.count and source is not None:
+                self._captured_object(one, source, cameras)
+
     def share_source_light(
         self, pair: tuple[Gaussians, SourceScene], other: "TransferValues", theirs: tuple[Gaussians, SourceScene]
     ) -> None:
         """Copy the light at an object's old place from other values, instead of estimating it again.
 
         Args:
-            pair: The object and its source scene here, for example with fewer Gaussians.
+            pair: The object here, for example with fewer Gaussians, and its source scene.
             other: The values that may hold the light.
             theirs: The same object and source scene there.
         """
