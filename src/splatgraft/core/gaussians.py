@@ -71,7 +71,8 @@ class Gaussians:
 
     def select(self, which: Bool[Tensor, "n"] | Int[Tensor, "m"]) -> Self:
         """Select the Gaussians where the mask is true, or those at the given indices, in their order."""
-        return self.map(lambda tensor: tensor[which])
+        rows = which.nonzero()[:, 0] if which.dtype == torch.bool else which
+        return self.map(lambda tensor: tensor.index_select(0, rows))
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
         """Apply `function` to every tensor."""

@@ -130,7 +130,7 @@ def _receivers(
     for sphere in spheres:
         reached |= reachable(scene.means, sphere, samples, farthest=region.radius, rims=rims + sphere.radius)
     indices = (reached & maps.covers(scene.means)).nonzero()[:, 0]
-    gaussians = scene.select(indices)
+    gaussians = scene.with_sh_degree(0).select(indices)
     normals = captured.normals.vectors[indices]
     return Receivers(
         gaussians=gaussians,

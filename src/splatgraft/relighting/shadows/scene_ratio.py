@@ -153,7 +153,7 @@ def scene_shadow_maps(
         in_beam |= (along > 0) & (along < length) & (_from_axis(away, direction) < reach)
     parts = ((sources, _SOURCE_SIZE, in_beam), (samples.of_ambient, _AMBIENT_SIZE, near))
     for part, size, is_blocker in parts:
-        blockers = scene.select(is_blocker)
+        blockers = scene.with_sh_degree(0).select(is_blocker)
         window = Window(center=region.center, radius=region.radius, frames=frames_along(part.directions))
         nearest = -torch.tensor(part.blockers_within).clamp_max(region.radius)
         # Gaussians finer than a pixel of the map add no detail, so a random part of them is enough
