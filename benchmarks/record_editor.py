@@ -19,10 +19,10 @@ WINDOW_WIDTH, WINDOW_HEIGHT = 1300, 540
 WIDTH, QUALITY, LONGEST_MS = 650, 55, 1000
 STEPS, HANG_LIMIT = 14, 300.0
 # places in the window, pixels, in the view after the orbit
-ORBIT = (700, 60), (620, 130)
-DRAG = (555, 300), (470, 380)
-TURN = (470, 380), (530, 380)
-RIM, TIP = (760, 228), (568, 238)
+ORBIT = (700, 60), (665, 105)
+DRAG = (700, 400), (530, 350)
+TURN = (530, 350), (590, 350)
+RIM, TIP = (622, 216), (452, 262)
 CURSOR = """addEventListener("DOMContentLoaded", () => {
   const dot = document.body.appendChild(document.createElement("div"));
   Object.assign(dot.style, {position: "fixed", width: "18px", height: "18px", margin: "-9px", borderRadius: "50%",
