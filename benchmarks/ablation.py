@@ -136,24 +136,16 @@ def past_no_scene(maps: SceneShadowMaps, points: Tensor, normals: Tensor, **_hei
     return torch.ones(len(points), sources + len(maps.ambient_maps.first))
 
 
-def past_no_object(
-    gaussians: Gaussians, sphere: object, normals: Tensor, lights: Sequence[LightSamples]
-) -> tuple[Tensor, ...]:
-    return tuple(torch.ones(gaussians.count, len(samples)) for samples in lights)
+def past_no_object(gaussians: Gaussians, sphere: object, normals: Tensor, samples: LightSamples) -> Tensor:
+    return torch.ones(gaussians.count, len(samples))
 
 
 def past_object(
-    gaussians: Gaussians,
-    sphere: BoundingSphere,
-    normals: Tensor,
-    lights: Sequence[LightSamples],
-    *,
-    sources_pass: bool,
-) -> tuple[Tensor, ...]:
+    gaussians: Gaussians, sphere: BoundingSphere, normals: Tensor, samples: LightSamples, *, sources_pass: bool
+) -> Tensor:
     """Return the visibility past the object, but 1 for the sources' samples, or for those of the ambient light."""
-    passes = [torch.tensor(samples.is_source) == sources_pass for samples in lights]
-    shares = self_visibility(gaussians, sphere, normals, lights)
-    return tuple(torch.where(passing, 1, share) for passing, share in zip(passes, shares, strict=True))
+    passing = torch.tensor(samples.is_source) == sources_pass
+    return torch.where(passing, 1, self_visibility(gaussians, sphere, normals, samples))
 
 
 def with_samples(function: Callable[..., Any], at: int, **values: float) -> Callable[..., Any]:

@@ -297,7 +297,7 @@ def test_the_divider_shows_the_picture_before_on_its_left(editor: Editor, window
 
 
 class LeavingView(View):
-    """A view that another thread turns away from its photo once the photo has been asked for."""
+    """A view whose photo another thread leaves after the first look at it."""
 
     asked = 0
 

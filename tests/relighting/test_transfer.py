@@ -286,7 +286,7 @@ def test_values_that_moved_with_the_object_give_what_new_ones_do():
 def test_an_object_is_examined_once_and_lit_as_new_wherever_it_stands(monkeypatch):
     examined, examine = [], transfer.capture_object
     monkeypatch.setattr(transfer, "capture_object", lambda *a, **more: examined.append(a[0]) or examine(*a, **more))
-    body, source, target = ball(), SourceScene(shell(count=500), cameras()), floor(count=40)
+    body, source, target = ball(), SourceScene(empty(), cameras(), light=GIVEN), floor(count=40)
     places = (at(0.0, 0.0, 0.35), at(0.0, 0.0, 0.35, rotation=QUARTER), at(0.3, 0.0, 0.35, rotation=QUARTER))
     values, light = transfer.TransferValues(lambda: None), sun_from(-1, 0, 1)
     for place in places:

@@ -18,7 +18,7 @@ from splatgraft.compositing.composite import Composite
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.editor.scene_cache import SceneCache
 from splatgraft.editor.state import EditState
-from splatgraft.relighting import Relit, SourceScene
+from splatgraft.relighting import Relit
 from splatgraft.relighting.transfer import TransferValues
 from splatgraft.runtime.memo import Memo
 
@@ -118,7 +118,7 @@ class RelitPreview:
         composite, sources = self._scenes.composite(state), self._scenes.source_scenes(state)
         if self._scenes.files.transfers_light and (_is_large(composite) or not self._memo.has("relit")):
             with self._full_lock:
-                self._full_values.examine(composite, self._scenes.cameras("target"), sources)
+                self._full_values.capture_objects(composite, self._scenes.cameras("target"), sources)
             with self._draft_lock if _is_large(composite) else self._full_lock:
                 shared = (composite.target, composite.erased, *sources)
                 self._memo.get("drafts prepared", shared, lambda: self._draft(state, with_sources=True))
@@ -149,7 +149,7 @@ class RelitPreview:
 
     def _draft(self, state: EditState, *, with_sources: bool = False) -> Draft:
         composite = self._scenes.composite(state)
-        sources: list[SourceScene | None] = list(self._scenes.source_scenes(state))
+        sources = self._scenes.source_scenes(state)
         if not (with_sources or self._memo.has("relit") or self._memo.has("drafts prepared")):
             # analysing the source scene takes half of the time of the first result
             sources = [None] * len(sources)

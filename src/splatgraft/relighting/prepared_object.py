@@ -3,8 +3,8 @@
 1. Find the light in the object's capture (`find_source_light`).
 2. Estimate normals and materials in the object's own frame (`capture_object`). They do not depend on the placement.
 3. Place the object: turn these values, splat shadow maps, and compute self-visibility (`prepare_object`).
-4. Move the results with the object (`PreparedObject.moved`). They are computed again after a rotation, a change of
-   scale, or a change of the sources' directions.
+4. Move the results with the object (`PreparedObject.moved`). Step 3 is done again after a rotation, a change of scale,
+   or a change of the sources' directions.
 """
 
 import math
@@ -63,7 +63,7 @@ class SourceLighting:
     """The light that an object of n Gaussians was captured in."""
 
     light: Light
-    """The light, in the frame of the object that it belongs to."""
+    """The light; own frame in a `CapturedObject`, target's frame in a `PreparedObject`."""
     irradiance: Float[Tensor, "n 3"]
     """Linear rgb irradiance on each Gaussian under that light."""
     materials: Materials
@@ -210,7 +210,7 @@ def capture_object(
         reason = old.reason if isinstance(old, NoLight) else ""
         return CapturedObject(gaussians, normals, None, reason)
     samples = sample_light(old)
-    (visible,) = self_visibility(gaussians, sphere, normals.vectors, (samples,))
+    visible = self_visibility(gaussians, sphere, normals.vectors, samples)
     received = irradiance(samples, normals.vectors, sample_visibility=visible)
     materials = estimate_materials(gaussians, normals.vectors, views, reflected_light(old, samples, visible))
     estimate = source_light if isinstance(source_light, EstimatedLight) else None
@@ -233,7 +233,7 @@ def prepare_object(placed: PlacedObject, captured: CapturedObject, light: Light,
     lighting = captured.lighting
     if lighting is not None:
         lighting = replace(lighting, light=lighting.light.rotated(turned))
-    (visible,) = self_visibility(gaussians, sphere, normals.vectors, (samples,))
+    visible = self_visibility(gaussians, sphere, normals.vectors, samples)
     radiance = _albedo(gaussians, lighting) * irradiance(samples, normals.vectors, sample_visibility=visible) / math.pi
     return PreparedObject(
         number=number,

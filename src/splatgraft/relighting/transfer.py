@@ -141,7 +141,7 @@ class TransferValues:
         shadows = cast_shadows(scene, objects, merged.select(~is_object), views=views, budget=budget)
         return assemble_layers(merged, scene, objects, shadows)
 
-    def examine(self, composite: Composite, cameras: Cameras, sources: Sequence[SourceScene | None]) -> None:
+    def capture_objects(self, composite: Composite, cameras: Cameras, sources: Sequence[SourceScene | None]) -> None:
         """Compute what does not depend on placements: each object with its light at its old place."""
         for one, source in zip(composite.objects, sources, strict=True):
             if one.gaussians.count and source is not None:

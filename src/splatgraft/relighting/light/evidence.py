@@ -197,11 +197,12 @@ def _nothing(region: BoundingSphere) -> ShadingEvidence:
 
 
 def _occluders(scene: Gaussians, region: BoundingSphere) -> Occluders:
+    shapes = scene.with_sh_degree(0)  # colours block no light
     near = (scene.means - region.center).norm(dim=1) < _OCCLUDERS_WITHIN * region.radius
     chosen = (near & (scene.opacities > _OCCLUDER_OPACITY)).nonzero()[:, 0]
     if len(chosen) <= _MAX_OCCLUDERS:
-        return occluders_of(scene.with_sh_degree(0).select(chosen))
-    part = scene.with_sh_degree(0).select(chosen[_chosen(len(chosen), _MAX_OCCLUDERS)])
+        return occluders_of(shapes.select(chosen))
+    part = shapes.select(chosen[_chosen(len(chosen), _MAX_OCCLUDERS)])
     # fewer but wider Gaussians cover the same area
     grown = part.log_scales + 0.5 * math.log(len(chosen) / _MAX_OCCLUDERS)
     return occluders_of(replace(part, log_scales=grown))

@@ -3,7 +3,7 @@
 A Gaussian has one colour, so a Gaussian wider than a shadow's edge cannot show it. `shade_receivers` repeats:
 
 1. Compute the ratio at the centre of each Gaussian.
-2. While the budget lasts, split the Gaussians with the largest variation along an axis (`_worst_axis`).
+2. While the budget lasts, split the Gaussians with the largest variation along an axis (`_most_varying_axis`).
 
 A plain surface is a layer of Gaussians whose centres lie above and below it. The layer's middle (`layer_middle`) is the
 surface. Visibility is tested above its top (`layer_height`), because upper Gaussians would shadow lower ones (acne).
@@ -86,11 +86,9 @@ def shade_receivers(
         by_sources = _sums(pending, maps, sources=True)
         ratio, room = ratio_from_sums(by_sources + ambient), budget // (PIECES - 1)
         if round_ == _MAX_SPLITS or room == 0:
-            done.append((pending, which, ratio, ambient))
             break
-        axis, wanted = _worst_axis(pending, maps, (by_sources, ambient), ratio)
+        axis, wanted = _most_varying_axis(pending, maps, (by_sources, ambient), ratio)
         if not bool((wanted > 0).any()):
-            done.append((pending, which, ratio, ambient))
             break
         order = wanted.argsort(descending=True)[: min(room, int((wanted > 0).sum()))]
         keep = torch.ones(len(wanted), dtype=torch.bool)
@@ -104,6 +102,7 @@ def shade_receivers(
         anew = _broad(parents.gaussians, maps)[parent].nonzero()[:, 0]
         ambient[:, anew] = _sums(pending.select(anew), maps, sources=False)
         budget -= (PIECES - 1) * len(order)
+    done.append((pending, which, ratio, ambient))
     joined = Receivers(
         gaussians=concatenate([r.gaussians for r, _, _, _ in done]),
         normals=torch.cat([r.normals for r, _, _, _ in done]),
@@ -124,7 +123,7 @@ def _broad(gaussians: Gaussians, maps: ObjectShadowMaps) -> Bool[Tensor, "m"]:
     return gaussians.scales.max(1).values > _BROAD * maps.sphere.radius
 
 
-def _worst_axis(
+def _most_varying_axis(
     receivers: Receivers,
     maps: ObjectShadowMaps,
     center_sums: tuple[Float[Tensor, "3 m 3"], Float[Tensor, "3 m 3"]],

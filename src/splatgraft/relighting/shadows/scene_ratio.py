@@ -8,7 +8,6 @@ Differential rendering (Debevec 1998): the ratio of the irradiances with and wit
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -88,27 +87,24 @@ def object_shadow_maps(
 
 
 def self_visibility(
-    gaussians: Gaussians, sphere: BoundingSphere, normals: Float[Tensor, "m 3"], lights: Sequence[LightSamples]
-) -> tuple[Float[Tensor, "m _"], ...]:
-    """Compute the visibility of every sample of some lights from an object's own Gaussians, past the object itself.
+    gaussians: Gaussians, sphere: BoundingSphere, normals: Float[Tensor, "m 3"], samples: LightSamples
+) -> Float[Tensor, "m k"]:
+    """Compute the visibility of every sample of a light from an object's own Gaussians, past the object itself.
 
     Args:
         gaussians: The m Gaussians of the object.
         sphere: The object's bounding sphere.
         normals: Unit normals of their surfaces.
-        lights: Samples of each light; the directions of ambient samples are the same for all.
+        samples: The k samples of the light.
 
     Returns:
-        For each light, the share of its k samples that arrives, (m, k) in [0, 1].
+        Share of each sample that arrives, in [0, 1].
     """
-    sources = [samples.of_sources.directions for samples in lights]
-    directions = torch.cat([*sources, lights[0].of_ambient.directions])
-    window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(directions))
+    window = Window(center=sphere.center, radius=sphere.radius, frames=frames_along(samples.directions))
     maps = splat_depth_maps(occluders_of(gaussians), window, size=_AMBIENT_SIZE)
     visible = visibility(maps, raised(gaussians, normals), normals, bias=_SELF_BIAS * maps.texel)
-    *by_sources, ambient = visible.split([*map(len, sources), len(lights[0].of_ambient)], dim=1)
-    ambient = _SELF_AMBIENT + (1 - _SELF_AMBIENT) * ambient
-    return tuple(torch.cat([one, ambient], 1) for one in by_sources)
+    through = _SELF_AMBIENT + (1 - _SELF_AMBIENT) * visible
+    return torch.where(torch.tensor(samples.is_source), visible, through)
 
 
 @dataclass(frozen=True)

@@ -263,8 +263,8 @@ def _blend(splat, at, dv, du, maps):
     _, _, depth, ca, cb, cc, su, sv, opacity, _, cut, _ = splat
     near, transmittance = maps
     q = du * (du * ca + np.float32(2) * cb * dv) + cc * dv * dv
-    # exp(-q / 2) to 0.004, by squaring (1 - q / 128) six times; beyond q = 64, where nothing is blended, the squares
-    # would be denormal numbers, which take most machines a hundred times as long
+    # exp(-q / 2) to 0.004, by squaring (1 - q / 128) six times; nothing is blended where q is above 64, and without
+    # that bound the squares would be denormal numbers there, which are slow to compute
     bell = np.float32(1) - smaller(q, np.float32(64)) * np.float32(1 / 128)
     bell = bell * bell
     bell = bell * bell
