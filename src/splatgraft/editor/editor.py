@@ -96,7 +96,7 @@ class Editor:
         self.stream = Stream(self, self._drawing_failed)
         self._marker = LatestOnlyWorker(self._failed)
         self.background = LatestOnlyWorker(self._failed)
-        """Worker for what the panels show as soon as it is computed."""
+        """Worker for slow values of the panels, such as an outline, which are shown when they are there."""
         self.panels: dict[str, Panel] = {
             "Open": OpenPanel(self),
             "Select": SelectPanel(self),
