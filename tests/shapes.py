@@ -159,8 +159,8 @@ def _lit_scene(light_at: Callable[[Tensor], Tensor], strength: float) -> Gaussia
     return surfels(point[keep], normal[keep], width=0.03, srgb=srgb_from_linear(gray)[keep, None].repeat(1, 3))
 
 
-def clock_at(*directions: Tensor, error_deg: float = 5.0) -> ClockSun:
+def clock_at(*directions: Tensor, error_deg: float = 5.0, height_error_deg: float = 5.0) -> ClockSun:
     """Return the sun by a clock with these candidates."""
     noon = datetime(2026, 6, 1, 12, tzinfo=UTC)
     candidates = [SunCandidate(noon, "GPS", 30.0, tuple(one.tolist())) for one in directions]
-    return ClockSun(tuple(candidates), (0.0, 0.0, 1.0), error_deg, "a compass", None)
+    return ClockSun(tuple(candidates), (0.0, 0.0, 1.0), error_deg, height_error_deg, "a compass", None)

@@ -1,5 +1,6 @@
 """The sun by the photos' clock: from EXIF that Pillow writes, through `capture` and `check`, to clock_sun.json."""
 
+import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -391,6 +392,17 @@ def test_a_damaged_file_is_named(old: str, new: str, message: str, tmp_path: Pat
     with pytest.raises(ValueError, match=message) as error:
         read_clock_sun(tmp_path)
     assert str(error.value).startswith(str(path))
+
+
+def test_a_file_without_the_error_of_the_heights_takes_that_of_the_directions(tmp_path: Path) -> None:
+    sun = found(geotags(orbit, 14, OHIO), cameras_on(orbit, 14))
+    write_clock_sun(tmp_path, sun)
+    content = json.loads(clock_sun_path(tmp_path).read_text())
+    assert content.pop("height_error_deg") == sun.height_error_deg < sun.error_deg
+    clock_sun_path(tmp_path).write_text(json.dumps(content))
+    older = read_clock_sun(tmp_path)
+    assert older is not None
+    assert older.height_error_deg == older.error_deg == sun.error_deg
 
 
 @pytest.mark.skipif(not LEWIS.is_dir(), reason="the photos are not part of the repository")

@@ -83,7 +83,9 @@ def test_copies_lose_the_same_old_light_and_a_strange_object_keeps_its_own(tmp_p
 def test_the_lights_of_both_places_are_drawn_past_an_object_without_gaussians(tmp_path: Path, capsys):
     nothing = ball().select(torch.zeros(0, dtype=torch.int64))
     objects = {"nothing.ply": (nothing, [at(0, 0)]), "own.ply": (ball(), [at(0, 0)])}
-    sun = ClockSun((SunCandidate(datetime(2019, 6, 12, 16, 46, tzinfo=UTC), "GPS", 44.0),), (0.0, 0.0, 1.0), 5.0, "up")
+    sun = ClockSun(
+        (SunCandidate(datetime(2019, 6, 12, 16, 46, tzinfo=UTC), "GPS", 44.0),), (0.0, 0.0, 1.0), 5.0, 5.0, "up"
+    )
     found = relit(tmp_path, (room(0.8), room(0.25)), objects, sun=sun)
     # the time is printed, but it is not in the report, which can be shared
     assert "12 June 2019, 16:46 UTC by GPS: sun 44.0 degrees high" in " ".join(capsys.readouterr().err.split())

@@ -358,7 +358,7 @@ def test_the_report_is_one_file_with_its_pictures(project, tmp_path, capsys):
 def test_nothing_that_is_exported_tells_when_the_photos_were_taken(tmp_path):
     project = write_transfer(tmp_path)
     time = datetime(2019, 6, 12, 16, 46, tzinfo=timezone(timedelta(hours=-4)))
-    sun = ClockSun((SunCandidate(time, "GPS", 44.0, (0.6, 0.0, 0.8)),), (0.0, 0.0, 1.0), 5.0, "a track")
+    sun = ClockSun((SunCandidate(time, "GPS", 44.0, (0.6, 0.0, 0.8)),), (0.0, 0.0, 1.0), 5.0, 5.0, "a track")
     write_clock_sun(project / "target" / "capture", sun)
     (project / "report").mkdir()
     picture = torch.rand(60, 80, 3, generator=torch.Generator().manual_seed(0))

@@ -25,7 +25,7 @@ from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import EstimatedLight, _source, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
-from splatgraft.relighting.light.known_sun import BY_CLOCK, direction_by_clock, sun_towards
+from splatgraft.relighting.light.known_sun import BY_CLOCK, sun_towards
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient, light_confidence
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
@@ -511,20 +511,6 @@ def test_a_room_ends_at_its_walls_and_a_garden_does_not(near_height, outdoors):
     assert _source(patch, torch.ones(1, 3), bright, within=1.0).name == ("bright patch" if outdoors else "window")
     named = replace(estimate_of(under_sun()), evidence=evidence).with_sun(Sun(SUN, 0.3, UP, torch.ones(3), 50.0), scene)
     assert named.light.sources[0].name == ("sun" if outdoors else "sun or window")
-
-
-def test_a_direction_by_the_clock_is_averaged_with_a_source_that_may_be_the_sun():
-    assert direction_by_clock(None, None) is None
-    alone = direction_by_clock(clock_at(SUN), None)
-    assert alone is not None
-    assert torch.equal(alone[0], SUN)
-    assert alone[1] == 5.0
-    # a source 8 degrees away with the same error may be the sun: the mean is half as far
-    off = torch.nn.functional.normalize(SUN + 0.14 * torch.linalg.cross(SUN, UP), dim=0).tolist()
-    near = LightSource((off[0], off[1], off[2]), (1.0, 1.0, 1.0), uncertainty_deg=5.0)
-    joined = direction_by_clock(clock_at(SUN), near)
-    assert joined is not None
-    assert degrees_apart(joined[0], SUN) == pytest.approx(degrees_apart(torch.tensor(off), SUN) / 2, rel=0.01)
 
 
 def test_shading_and_highlights_show_how_strong_a_sun_in_a_known_direction_is():

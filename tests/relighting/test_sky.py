@@ -92,13 +92,13 @@ def test_a_clear_sky_shows_where_the_sun_is_although_trees_hide_a_third_of_it(tu
     trees = torch.sin(7 * torch.atan2(directions[:, 1], directions[:, 0]) + 1) > 0.5
     noise = torch.randn(len(directions), generator=torch.Generator().manual_seed(0))
     luminance = torch.where(trees & (directions[:, 2] < 0.3), 0.05 * noise.exp(), luminance)
-    likelihoods = SkyEvidence.of(captured(luminance, directions)).log_likelihoods(ABOVE)
-    best = ABOVE[likelihoods.argmax()]
-    off = (azimuth_deg(best) - azimuth_deg(sun) + 180) % 360 - 180
+    evidence = SkyEvidence.of(captured(luminance, directions))
+    assert evidence.is_clear
+    log_density = evidence.log_density(ABOVE)
+    off = (azimuth_deg(ABOVE[log_density.argmax()]) - azimuth_deg(sun) + 180) % 360 - 180
     assert abs(off) < 10  # two cells
-    assert float(likelihoods.max()) > 3  # the bar of known_sun
     near = (sun @ ABOVE.T) > math.cos(math.radians(8))
-    assert float(likelihoods.max() - likelihoods[near].max()) < 2  # the right height is not ruled out
+    assert float(log_density.max() - log_density[near].max()) < 2  # the right height is not ruled out
 
 
 def test_skies_and_walls_whose_brightness_says_nothing_of_a_sun_are_not_clear_skies():
@@ -109,7 +109,7 @@ def test_skies_and_walls_whose_brightness_says_nothing_of_a_sun_are_not_clear_sk
     sides = (4 * torch.atan2(directions[:, 1], directions[:, 0]) / math.pi).floor()
     walls = torch.tensor([0.1, 0.5, 0.05, 0.3, 0.8, 0.15, 0.6, 0.2])[sides.long() % 8]
     for luminance in (overcast, even, walls, 0.2 * noise.exp()):
-        assert float(SkyEvidence.of(captured(luminance, directions)).log_likelihoods(ABOVE).max()) < 3
+        assert not SkyEvidence.of(captured(luminance, directions)).is_clear
 
 
 def test_a_view_without_sky_says_nothing():
@@ -147,11 +147,29 @@ def test_the_sun_is_known_by_the_clock_then_by_the_sky_then_by_the_brightest_sou
     assert known is not None
     assert known.name == BY_CLOCK
     assert float(known.directions[known.log_density.argmax()] @ by_clock) > math.cos(math.radians(4))
-    # a clear sky makes a weak sun less probable, with a clock and without one
-    for scene in (clear, CapturedScene(clear.gaussians, clear.cameras, clock_at(SUN))):
-        shown = clear_sky_evidence(scene)
-        assert shown is not None
-        assert shown.is_clear > 0.5  # the probability where no sky is seen
+    assert clear_sky_evidence(timed) is not None
+
+
+def test_the_height_by_the_clock_counts_more_than_that_by_the_sky_and_by_shading():
+    directions = even_directions(12000)
+    low, high = (torch.tensor([math.cos(h), 0.0, math.sin(h)]) for h in (0.45, 0.95))  # 26 and 54 degrees
+    shown = captured(preetham(directions, SUN, 3.0) * 0.02, directions)
+    x, y, z = high.tolist()
+    main = LightSource((x, y, z), (1.0, 1.0, 1.0), uncertainty_deg=8.0)
+    aside = torch.tensor([math.cos(0.2) * float(low[0]), math.sin(0.2) * float(low[0]), float(low[2])])
+    clock = clock_at(aside, error_deg=10.0, height_error_deg=1.0)
+    timed = CapturedScene(shown.gaussians, shown.cameras, clock)
+    known = known_sun(timed, main, clear_sky_evidence(timed), outdoors=True, is_unseen=True)
+    assert known is not None
+    found = known.directions[known.log_density.argmax()]
+    assert math.degrees(math.asin(float(found[2]))) == pytest.approx(math.degrees(0.45), abs=3)
+    assert abs(azimuth_deg(found)) < 5  # the clock is 11 degrees off
+    # a source that cannot be the sun is not followed
+    alone = CapturedScene(shown.gaussians, shown.cameras, clock_at(SUN))
+    wrong = replace(main, direction=(0.0, -0.8, 0.6), uncertainty_deg=2.0)
+    known = known_sun(alone, wrong, None, outdoors=True, is_unseen=True)
+    assert known is not None
+    assert float(known.directions[known.log_density.argmax()] @ SUN) > math.cos(math.radians(3))
 
 
 @pytest.mark.parametrize("turbidity", [2.0, 4.0])

@@ -75,19 +75,22 @@ def sun_by_clock(tags: Sequence[Geotag], cameras: Cameras) -> ClockSun | None:
         return None
     found = _orientation(tags, cameras)
     knows_north = found.covariance[2, 2] < _KNOWN_RAD**2
-    candidates, variances = [], []
+    candidates, variances, of_heights = [], [], []
     for sun, azimuth_deg in suns:
         height, azimuth = math.radians(sun.height_deg), math.radians(azimuth_deg)
         level = np.array([math.sin(azimuth), math.cos(azimuth), 0.0])
         towards = math.cos(height) * level + math.sin(height) * _UP
         x, y, z = (found.enu_from_world.T @ towards).tolist()
         candidates.append(replace(sun, direction=(x, y, z) if knows_north else None))
-        # a small rotation r moves the direction by r x direction, and the height by r . (direction x up)
-        moves = np.cross(np.eye(3), towards) if knows_north else np.cross(level, _UP)[:, None]
-        variances.append(float(np.trace(moves.T @ found.covariance @ moves)))
+        # a small rotation r moves the height by r . (level x up), and the direction by r x direction
+        tilts, moves = np.cross(level, _UP), np.cross(np.eye(3), towards)
+        of_heights.append(float(tilts @ found.covariance @ tilts))
+        variances.append(float(np.trace(moves.T @ found.covariance @ moves)) if knows_north else of_heights[-1])
     x, y, z = (found.enu_from_world.T @ _UP).tolist()
-    error_deg = math.hypot(math.degrees(math.sqrt(max(variances))), _SUN_DEG_PER_H * spread_h)
-    return ClockSun(tuple(candidates), (x, y, z), error_deg, found.source, found.metres_per_unit)
+    error_deg, height_error_deg = (
+        math.hypot(math.degrees(math.sqrt(max(one))), _SUN_DEG_PER_H * spread_h) for one in (variances, of_heights)
+    )
+    return ClockSun(tuple(candidates), (x, y, z), error_deg, height_error_deg, found.source, found.metres_per_unit)
 
 
 def geotag_notes(tags: Sequence[Geotag], names: Sequence[str]) -> list[Note]:

@@ -61,6 +61,8 @@ class ClockSun:
     """Unit up direction by which the heights count, world frame."""
     error_deg: float
     """Standard error of the directions, degrees, or of the heights if no azimuth is known."""
+    height_error_deg: float
+    """Standard error of the heights above the horizon, degrees."""
     source: str
     """Evidence for the world's orientation, for messages."""
     metres_per_unit: float | None = None

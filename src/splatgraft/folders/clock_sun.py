@@ -1,9 +1,11 @@
 """clock_sun.json of a capture: the sun's direction by the photos' clock. It holds no place.
 
     {"candidates": [{"time": "2019-06-12T16:46:00-04:00", "clock": "GPS", "height_deg": 44.0, "direction": [x, y, z]}],
-     "up": [x, y, z], "error_deg": 4.0, "source": "the track of 54 GPS positions", "metres_per_unit": 151.2}
+     "up": [x, y, z], "error_deg": 4.0, "height_error_deg": 2.0, "source": "the track of 54 GPS positions",
+     "metres_per_unit": 151.2}
 
-`direction` and `metres_per_unit` may be null. All vectors are in the capture's world.
+`direction` and `metres_per_unit` may be null. Without `height_error_deg`, heights have the error `error_deg`. All
+vectors are in the capture's world.
 """
 
 from dataclasses import asdict
@@ -39,11 +41,12 @@ def read_clock_sun(capture: Path) -> ClockSun | None:
     content = load(path)
     if not isinstance(content, dict) or not isinstance(content.get("candidates"), list) or not content["candidates"]:
         raise ValueError(f"{path}: expected an object with a list of candidates, found {excerpt(content)}")
-    metres = content.get("metres_per_unit")
+    metres, error_deg = content.get("metres_per_unit"), number(path, content, "error_deg")
     return ClockSun(
         candidates=tuple(_candidate(path, entry) for entry in content["candidates"]),
         up=_unit(path, content, "up"),
-        error_deg=number(path, content, "error_deg"),
+        error_deg=error_deg,
+        height_error_deg=number(path, content, "height_error_deg") if "height_error_deg" in content else error_deg,
         source=str(content.get("source")),
         metres_per_unit=None if metres is None else number(path, content, "metres_per_unit"),
     )

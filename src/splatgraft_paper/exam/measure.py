@@ -77,7 +77,7 @@ def _simulated_clock(scene: ExamScene) -> ClockSun:
     angle = math.radians(random.Random(scene.name).gauss(0, _CLOCK_ERROR_DEG))
     turned = (math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y, z)
     candidate = SunCandidate(datetime(2000, 1, 1, tzinfo=UTC), "simulation", math.degrees(math.asin(z)), turned)
-    return ClockSun((candidate,), (0.0, 0.0, 1.0), _CLOCK_ERROR_DEG, "simulation", None)
+    return ClockSun((candidate,), (0.0, 0.0, 1.0), _CLOCK_ERROR_DEG, 0.0, "simulation", None)
 
 
 def _with_reflections(scene: ExamScene) -> ReflectiveScene:

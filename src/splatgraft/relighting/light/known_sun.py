@@ -1,7 +1,7 @@
 """The sun where it is known that there is one: by the clock of the photos, or out of doors.
 
 Out of doors the sun is known by a clear sky, whose brightness shows where it stands (`sky.py`), or as the brightest
-source that no camera saw. A clear sky also helps the clock.
+source that no camera saw. The log densities of clock, sky and source are added.
 
 Clouds or walls may still hide the sun. So the sun's strength, its irradiance on level ground over that of
 all other light, has a posterior:
@@ -47,12 +47,11 @@ _CLEAR_SD = 0.26  # standard deviation of the logarithm of that
 _TINT = (1.34, 0.97, 0.58)  # strength in red, green and blue over that in luminance
 
 # set by hand
-_IS_CLEAR = 0.5  # probability of a clear sky if the views do not show it
-_SHADING_IS_WRONG = 0.3  # probability that the brightest source is not the sun, beside a clear sky
+_IS_CLEAR, _SEEN_IS_CLEAR = 0.5, 0.9  # probability of a clear sky if the views do not show one, and if they do
+_SHADING_IS_WRONG = 0.3  # probability that the brightest source is not the sun, beside other evidence
 _STRENGTHS = torch.logspace(-2, 1.4, 35, dtype=torch.float64)
 _LEAST = 0.1  # strength below which the sun is hidden
 _SUN_RADIUS_DEG = 0.27
-_NEAR = 2.5  # standard errors between the clock's sun and an estimated source that may be the same
 _ROUNDS = 8  # iterations of reweighting
 
 # a shade that nothing captured casts; set by hand
@@ -78,17 +77,6 @@ class KnownSun:
     """Name in reports."""
 
 
-def direction_by_clock(clock: ClockSun | None, main: LightSource | None) -> tuple[Float[Tensor, "3"], float] | None:
-    """Return direction and standard error, degrees, of the clock's most trusted candidate; None without one.
-
-    Args:
-        clock: The sun by the clock of the photos.
-        main: Brightest estimated source. If it may be the sun, its direction is averaged with the clock's.
-    """
-    directions = clock_directions(clock)
-    return _joined(directions[0], clock.error_deg, main) if clock is not None and len(directions) else None
-
-
 def known_sun(
     captured: CapturedScene, main: LightSource | None, sky: SkyEvidence | None, *, outdoors: bool, is_unseen: bool
 ) -> KnownSun | None:
@@ -101,17 +89,33 @@ def known_sun(
         outdoors: Whether the scene is out of doors.
         is_unseen: Whether no camera saw `main`, so that it may be the sun.
     """
-    above = suns_above(captured.up)
-    by_sky = torch.zeros(len(above)) if sky is None else sky.log_likelihood
-    by_clock = direction_by_clock(captured.clock, main)
-    if by_clock is not None:
-        near_clock = prior_near(by_clock[0][None], by_clock[1])
-        return KnownSun(above, by_sky + near_clock(above), BY_CLOCK)
-    if outdoors and is_unseen and main is not None:
-        wrong = 0.0 if sky is None else _SHADING_IS_WRONG
-        near_main = prior_near(torch.tensor([main.direction]), main.uncertainty_deg, wrong=wrong)
-        return KnownSun(above, by_sky + near_main(above), "sun")
-    return None if sky is None else KnownSun(above, by_sky, "sun")
+    directions = suns_above(captured.up)
+    log_density = torch.zeros(len(directions)) if sky is None else sky.log_density(directions)
+    clock = captured.clock if len(clock_directions(captured.clock)) else None
+    may_be_sun = (
+        main is not None and not math.isfinite(main.distance) and (clock is not None or (outdoors and is_unseen))
+    )
+    if clock is None and sky is None and not may_be_sun:
+        return None
+    if clock is not None:
+        log_density = log_density + _by_clock(directions, clock)
+    if main is not None and may_be_sun:
+        wrong = 0.0 if clock is None and sky is None else _SHADING_IS_WRONG
+        towards = torch.tensor([main.direction])
+        log_density = log_density + prior_near(towards, main.uncertainty_deg, wrong=wrong)(directions)
+    return KnownSun(directions, log_density, "sun" if clock is None else BY_CLOCK)
+
+
+def _by_clock(directions: Float[Tensor, "k 3"], clock: ClockSun) -> Float[Tensor, "k"]:
+    """Compute the log density of the clock's most trusted candidate, up to a constant."""
+    up, sun = torch.tensor(clock.up), clock_directions(clock)[0]
+    height_error = max(clock.height_error_deg, ERROR_DEG)
+    level_error = max(math.sqrt(max(clock.error_deg**2 - clock.height_error_deg**2, 0.0)), ERROR_DEG)
+    sines, sine = (directions @ up).clamp(-1, 1), (sun @ up).clamp(-1, 1)
+    level, level_sun = directions - sines[:, None] * up, sun - sine * up
+    turned = torch.atan2(torch.linalg.cross(level_sun.expand_as(level), level) @ up, level @ level_sun)
+    higher_deg, aside_deg = torch.rad2deg(sines.asin() - sine.asin()), torch.rad2deg(turned) * level_sun.norm()
+    return -0.5 * ((higher_deg / height_error).square() + (aside_deg / level_error).square())
 
 
 def clear_ratio(sine: float) -> Float[Tensor, "3"]:
@@ -138,7 +142,7 @@ def sun_towards(
     Returns:
         The sun with its ratio; None if the evidence is against a sun there.
     """
-    log_posterior = _log_prior(float(sun.direction @ evidence.up), _IS_CLEAR if sky is None else sky.is_clear)
+    log_posterior = _log_prior(float(sun.direction @ evidence.up), _IS_CLEAR if sky is None else _SEEN_IS_CLEAR)
     log_posterior -= _costs(problem, evidence, rest, sun.direction) / problem.settings.temperature
     strength = float(_STRENGTHS[log_posterior.argmax()])
     if strength < _LEAST:
@@ -202,21 +206,6 @@ def _tones(log_rgb: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     """
     red, green, blue = log_rgb.unbind(-1)
     return torch.stack([(log_rgb.exp() @ LUMINANCE).log(), red - blue, green - 0.5 * (red + blue)], -1)
-
-
-def _joined(
-    direction: Float[Tensor, "3"], error_deg: float, main: LightSource | None
-) -> tuple[Float[Tensor, "3"], float]:
-    """Average a direction with that of a distant source within `_NEAR` standard errors, weighted by precision."""
-    if main is None or math.isfinite(main.distance):
-        return direction, error_deg
-    other = torch.tensor(main.direction)
-    apart_deg = math.degrees(math.acos(max(-1.0, min(1.0, float(direction @ other)))))
-    if apart_deg > _NEAR * math.hypot(error_deg, main.uncertainty_deg):
-        return direction, error_deg
-    precisions = 1 / max(error_deg, ERROR_DEG) ** 2, 1 / max(main.uncertainty_deg, ERROR_DEG) ** 2
-    mean = torch.nn.functional.normalize(precisions[0] * direction + precisions[1] * other, dim=0)
-    return mean, sum(precisions) ** -0.5
 
 
 def _log_prior(sine: float, is_clear: float) -> Float[Tensor, "r"]:

@@ -3,6 +3,8 @@
 A clear sky is brighter around the sun and towards the horizon. The models are the five clear skies of CIE S 011:2003
 (types 11 to 15). The brightness of the whole sky is unknown. Views also show other things above the horizon, such as
 trees, so each direction shows either the sky or something of any brightness.
+
+These skies place the sun well in azimuth. In height real ones differ from them, so its height has an error of its own.
 """
 
 import math
@@ -10,17 +12,20 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from splatgraft.core.directions import even_directions
+from splatgraft.core.directions import even_directions, tangents
 from splatgraft.core.images import LUMINANCE, linear_from_srgb
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.panorama import CLIPPED
 from splatgraft.relighting.light.sun import LOWEST_SINE
 
 _SUNS = even_directions(6400)  # directions in which the sun may stand, 2.5 degrees apart
+_HEIGHTS = torch.deg2rad(torch.arange(2.5, 90, 5.0))
+_AZIMUTHS = torch.deg2rad(torch.arange(0, 360, 2.5))
 _SKIES = (  # CIE S 011: a and b of the gradation from zenith to horizon, c, d and e of the indicatrix around the sun
     (-1.0, -0.55, 10.0, -3.0, 0.45),
     (-1.0, -0.32, 10.0, -3.0, 0.45),
@@ -28,6 +33,7 @@ _SKIES = (  # CIE S 011: a and b of the gradation from zenith to horizon, c, d a
     (-1.0, -0.15, 16.0, -3.0, 0.30),
     (-1.0, -0.15, 24.0, -2.8, 0.15),
 )
+_HEIGHT_SD_DEG = 15.0  # standard error of the sun's height, fitted by benchmarks/fit_sky.py
 
 # set by hand
 _CELLS = even_directions(1600)  # directions into which pixels are sorted, 5 degrees apart
@@ -35,9 +41,7 @@ _EVERY, _FEWEST = 3, 4  # stride of the pixels, and fewest pixels of a cell
 _SD = 0.2  # standard deviation of the logarithm of a sky's luminance
 _IS_SKY = 0.75  # prior probability that a cell shows the sky
 _ANY = 0.2  # density of the logarithm of the luminance of other things
-_AS_LIKELY = 2.4  # log likelihood of a clear sky at which it is as likely as not
-_MOST_CLEAR = 0.9  # maximum probability of a clear sky
-_TEMPERATURE = 8.0  # divisor of log likelihoods, because neighbouring cells share their errors
+_CLEAR_FROM = 19.2  # log likelihood from which a sky counts as clear
 _BRIGHTNESS = torch.arange(-5.0, 5.0, 0.1)  # bins of the logarithm of a cell's luminance over that of the model
 _SKY_BRIGHTNESS = _BRIGHTNESS[20:-20:2]  # brightnesses of the whole sky that are tried, in the same unit
 
@@ -103,14 +107,32 @@ class SkyEvidence:
         return (self.directions @ self.up).clamp_min(LOWEST_SINE)
 
     @cached_property
-    def log_likelihood(self) -> Float[Tensor, "k"]:
-        """Log likelihood of clear skies with each of the k `suns_above`, as of `log_likelihoods`."""
-        return self.log_likelihoods(suns_above(self.up))
+    def by_height(self) -> Float[Tensor, "h a"]:
+        """Log likelihood of clear skies, as of `log_likelihoods`, with the sun at `_HEIGHTS` and `_AZIMUTHS`."""
+        right, ahead = tangents(self.up)
+        level = _AZIMUTHS.cos()[:, None] * right + _AZIMUTHS.sin()[:, None] * ahead
+        suns = _HEIGHTS.cos()[:, None, None] * level + _HEIGHTS.sin()[:, None, None] * self.up
+        return self.log_likelihoods(suns.reshape(-1, 3)).reshape(len(_HEIGHTS), -1)
+
+    def log_density(self, suns: Float[Tensor, "k 3"]) -> Float[Tensor, "k"]:
+        """Compute the log density of the sun in k unit directions, up to a constant.
+
+        It is the likelihood, averaged over heights by the standard error of the height.
+        """
+        kernel = (-0.5 * ((_HEIGHTS[:, None] - _HEIGHTS) / math.radians(_HEIGHT_SD_DEG)).square()).log_softmax(1)
+        averaged = (kernel[:, :, None] + self.by_height).logsumexp(1)
+        right, ahead = tangents(self.up)
+        azimuth = torch.atan2(suns @ ahead, suns @ right) % (2 * math.pi)
+        height = (suns @ self.up).clamp(-1, 1).asin()
+        # from -1 to 1 between the first and the last azimuth, which is the first again, and between the heights
+        at = torch.stack([azimuth / math.pi - 1, 2 * (height - _HEIGHTS[0]) / (_HEIGHTS[-1] - _HEIGHTS[0]) - 1], -1)
+        around = torch.cat([averaged, averaged[:, :1]], 1)
+        return F.grid_sample(around[None, None], at[None, None], padding_mode="border", align_corners=True)[0, 0, 0]
 
     @property
-    def is_clear(self) -> float:
-        """Probability that the sky is clear."""
-        return min(float((self.log_likelihood.max() - _AS_LIKELY).sigmoid()), _MOST_CLEAR)
+    def is_clear(self) -> bool:
+        """Whether the sky counts as clear."""
+        return float(self.by_height.max()) > _CLEAR_FROM
 
     @staticmethod
     def of(captured: CapturedScene) -> "SkyEvidence":
@@ -133,14 +155,13 @@ class SkyEvidence:
         """Compare clear skies with the sun in k unit directions with brightness that does not depend on direction.
 
         Returns:
-            Log likelihoods of the skies minus that without a sky, over `_TEMPERATURE`. They are 0 if the views show
-            nothing above the horizon.
+            Log likelihoods of the skies minus that without a sky, 0 if the views show nothing above the horizon.
         """
         if not len(self.directions):
             return torch.zeros(len(suns))
         cosines = (suns @ self.directions.T).clamp(-1, 1)
         found = torch.stack([self._under(kind, cosines)[0] for kind in _SKIES]).amax(0)
-        return (found - self._without_sky()) / _TEMPERATURE
+        return found - self._without_sky()
 
     def sky_with(self, sun: Float[Tensor, "3"]) -> ClearSky:
         """Find the likeliest clear sky with the sun in a unit direction."""
@@ -192,6 +213,6 @@ class SkyEvidence:
 
 
 def clear_sky_evidence(captured: CapturedScene) -> SkyEvidence | None:
-    """Return what the views show above the horizon if that is more likely a clear sky than not."""
+    """Return what the views show above the horizon if that is a clear sky."""
     evidence = SkyEvidence.of(captured)
-    return evidence if evidence.is_clear > 0.5 else None
+    return evidence if evidence.is_clear else None
