@@ -256,8 +256,8 @@ def without_object(captured: CapturedScene, place: Any, *, object_gaussians: Gau
     return estimate_light(captured, place)
 
 
-def changed_sun(captured: CapturedScene, region: Any, **changes: Any) -> Sun | None:
-    sun = find_sun(captured, region)
+def changed_sun(captured: CapturedScene, region: Any, *, outdoors: bool, **changes: Any) -> Sun | None:
+    sun = find_sun(captured, region, outdoors=outdoors)
     return None if sun is None else replace(sun, **changes)
 
 
@@ -539,7 +539,11 @@ ROWS: Mapping[str, Row] = {
     "even-ambient": Row(
         "sources", "direction of ambient light", {"relighting.light.estimate._ambient_of": even_ambient}
     ),
-    "sun": Row("sun", "the sun from shadows", {"relighting.light.estimate.find_sun": lambda captured, region: None}),
+    "sun": Row(
+        "sun",
+        "the sun from shadows",
+        {"relighting.light.estimate.find_sun": lambda captured, region, *, outdoors: None},
+    ),
     "sun-outdoors": Row(
         "sun",
         "the brightest unseen source out of doors is the sun",

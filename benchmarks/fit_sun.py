@@ -27,6 +27,7 @@ from splatgraft.relighting.light.estimate import region_around
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.sun import _DECISIVE, _DIRECTIONS, Sun, _ShadowEvidence, find_sun
 from splatgraft_paper.exam.scenes import ExamScene
+from splatgraft_paper.synthesis.places import OUTDOORS
 
 _BARS = (15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0)
 _NEAR_DEG = 5.0
@@ -154,7 +155,8 @@ def main() -> None:
                 points.append(compared)
                 right = "-" if compared[0] is None else f"{compared[0]:.0f}"
                 print(f"{name + suffix:28s} near a strong source {right}, elsewhere {compared[1]:.0f}", flush=True)
-            sun = find_sun(captured, region, decisive=min(_BARS))
+            outdoors = not suffix and any(kind in name for kind in OUTDOORS)
+            sun = find_sun(captured, region, outdoors=outdoors, decisive=min(_BARS))
             if sun is None:
                 continue
             one = judge(sun, truth)

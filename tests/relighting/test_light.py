@@ -38,9 +38,10 @@ from splatgraft.relighting.light.panorama import (
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem
 from splatgraft.relighting.light.sun import (
+    _DIRECTIONS,
     SET_BY_HAND,
     Sun,
-    _find_sun_within,
+    _ShadowEvidence,
     direction_through,
     find_sun,
     prior_near,
@@ -446,6 +447,25 @@ def test_shadows_far_from_a_small_object_show_the_sun(place, radius):
     assert degrees_apart(found.sun.direction, SUN) < 3
 
 
+def test_outdoors_shadows_on_the_ground_around_a_table_show_the_sun():
+    radius, height = 0.8, 0.7
+    turned = torch.nn.functional.normalize(even_directions(3000)[:, :2], dim=1)
+    top = torch.cat([radius * torch.linspace(0, 1, 3000).sqrt()[:, None] * turned, torch.full((3000, 1), height)], 1)
+    table = surfels(top, UP.repeat(3000, 1), srgb=0.5, width=0.03)
+
+    def shadow(at):
+        through = at + (height - at[:, 2:]) / SUN[2] * SUN
+        return torch.where(through[:, :2].norm(dim=1) < radius, 1 / (1 + 3 * float(SUN[2])), 1.0)
+
+    scene = concatenate([painted(under_sun().gaussians, shadow), table])
+    captured = CapturedScene(scene, ring(height=2.2, radius=1.4, focal=120.0))
+    region = BoundingSphere(torch.tensor([0.0, 0.0, height]), 0.9)
+    assert find_sun(captured, region) is None  # nothing stands on the table
+    found = find_sun(captured, region, outdoors=True)
+    assert found is not None
+    assert degrees_apart(found.direction, SUN) < 3
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("lamp", [(2.0, -2.0, 3.0), (-1.0, 2.5, 5.0)])
 def test_a_near_lamp_is_where_its_shadows_meet(lamp):
@@ -468,7 +488,9 @@ def test_shadows_that_prove_no_sun_move_one_that_exists():
     captured = CapturedScene(scene, views())
     # in the wider region lie the balls and their shadows, on a floor whose texels differ by a factor of e
     region = BoundingSphere(torch.tensor([1.8, 0.0, 0.3]), 0.8)
-    assert _find_sun_within(captured, region, 40.0) is None
+    shown = _ShadowEvidence.of(captured, region)
+    assert shown is not None
+    assert shown.best(shown.above(_DIRECTIONS))[1] < 40
     right, down = tangents(SUN)
     for aside in (right, -down):
         estimated = torch.nn.functional.normalize(SUN + math.tan(math.radians(12.0)) * aside, dim=0)

@@ -193,7 +193,8 @@ def estimate_light(
     hidden = search_radiance(problem)
     sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
     sky = clear_sky_evidence(captured) if evidence.is_outdoors else None
-    sun, known = set_sun(sun_through, whole) if sun_through else find_sun(whole, region), None
+    known = None
+    sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region, outdoors=evidence.is_outdoors)
     if sun is None:
         main = next(iter(sources), None)
         is_unseen = main is not None and main.name in _UNSEEN_NAMES

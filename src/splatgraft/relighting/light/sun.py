@@ -10,7 +10,8 @@
    is mixed with the chance that something unseen shades a texel, or a whole tile of the picture.
 4. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
 5. Compare the sun with lamps at a few heights, whose shadows diverge.
-6. If no direction is decisively better than no sun, do the same within the cameras' median distance.
+6. If no direction is decisively better than no sun, do the same within the cameras' median distance. Out of doors the
+   next level surface, such as the ground around a table, is searched, too, and the wider region is larger.
 
 Where a sun is known to exist, `sun_near` moves it to the shadows of several surfaces.
 
@@ -18,7 +19,7 @@ Where a sun is known to exist, `sun_near` moves it to the shadows of several sur
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 
@@ -63,10 +64,10 @@ _FINE_STEPS_DEG = (1.0, 0.33)  # of the grids around a maximum, three on each si
 _LAMP_HEIGHTS, _LAMP_SPAN_DEG = (4.0, 2.0), 10.0  # half widths of the surface; search around the sun's direction
 _PROMISING = 10.0  # log likelihood over that of even light above which a direction of the search is refined
 _DECISIVE = 40.0  # log likelihood over no sun above which there is a sun; chosen with benchmarks/fit_sun.py
-SURFACES = 2  # level surfaces whose shadows move a sun: a table, and the ground around it
+SURFACES = 2  # level surfaces whose shadows show a sun: a table, and the ground around it
 _STEP_DEG = 2.5  # of the grids of directions around a given one
 _IMPROBABLE = 4.5  # difference of log densities to the most probable direction, as at 3 standard errors
-_WIDER = 3.0  # radius of the region of `sun_near` over the given one: few things stand near a small object
+_WIDER = 3.0  # radius of a wider region over the given one: few things stand near a small object
 _TEMPERATURE = 5.0  # divisor of the shadows' log likelihood beside a prior, because texels share their errors
 _MIN_RATIO = 0.3  # minimum irradiance of a sun over that of all other light
 _MIN_RATIO_BY_HAND = 0.6  # the same for a sun set by hand if no edge of a shadow shows its strength
@@ -324,25 +325,23 @@ class _ShadowEvidence:
     """Share of all other light that reaches the texels."""
 
     @staticmethod
-    def on_surfaces(captured: CapturedScene, region: BoundingSphere, *, most: int) -> "list[_ShadowEvidence]":
-        """Collect the evidence of level surfaces in a region, without those with too few texels or no occluders.
+    def on_surfaces(captured: CapturedScene, region: BoundingSphere, *, most: int) -> "Iterator[_ShadowEvidence]":
+        """Yield the evidence of level surfaces in a region, without those with too few texels or no occluders.
 
         Args:
             captured: The scene.
             region: Sphere that contains the surfaces and the occluders on them.
             most: Maximum number of surfaces, the largest first.
         """
-        found = []
         for surface in find_surfaces(captured, region, most=most):
             standing, picture = standing_on(surface, captured.gaussians, region), draw_surface(captured, surface)
             if len(standing.means) and int(picture.valid.sum()) >= _MIN_TEXELS:
-                found.append(_ShadowEvidence(picture, standing, surface.ambient(standing)))
-        return found
+                yield _ShadowEvidence(picture, standing, surface.ambient(standing))
 
     @staticmethod
     def of(captured: CapturedScene, region: BoundingSphere) -> "_ShadowEvidence | None":
         """Collect the evidence of the largest level surface; None without one, with too few texels or no occluders."""
-        return next(iter(_ShadowEvidence.on_surfaces(captured, region, most=1)), None)
+        return next(_ShadowEvidence.on_surfaces(captured, region, most=1), None)
 
     @property
     def surface(self) -> Surface:
@@ -408,29 +407,33 @@ class _ShadowEvidence:
         return best, evidence
 
 
-def find_sun(captured: CapturedScene, region: BoundingSphere, *, decisive: float = _DECISIVE) -> Sun | None:
+def find_sun(
+    captured: CapturedScene, region: BoundingSphere, *, outdoors: bool = False, decisive: float = _DECISIVE
+) -> Sun | None:
     """Find the sun, or the lamp, whose shadows a level surface shows.
 
-    If the region shows none, the surface within the cameras' median distance is searched.
+    The largest level surface in the region is searched, then that within the cameras' median distance.
 
     Args:
         captured: The scene with all objects that cast shadows during the capture.
-        region: Sphere around the place that contains the surface and the occluders on it.
+        region: Sphere around the place that contains the surfaces and the occluders on them.
+        outdoors: Whether to search more surfaces in a wider region. In a room their shadows may show a false sun.
         decisive: Minimum log likelihood over that of no sun.
 
     Returns:
-        The sun; None if no direction is decisively better than no sun.
+        The sun on the first surface with one; None if no direction is decisively better than no sun.
     """
     distance = float((captured.cameras.centers - region.center).norm(dim=1).median())
-    radii = dict.fromkeys((region.radius, max(region.radius, distance)))
-    found = (_find_sun_within(captured, replace(region, radius=radius), decisive) for radius in radii)
-    return next((sun for sun in found if sun is not None), None)
+    wider, most = (_WIDER * region.radius, SURFACES) if outdoors else (region.radius, 1)
+    for radius in dict.fromkeys((region.radius, max(wider, distance))):
+        for shown in _ShadowEvidence.on_surfaces(captured, replace(region, radius=radius), most=most):
+            sun = _shown_sun(shown, region, decisive)
+            if sun is not None:
+                return sun
+    return None
 
 
-def _find_sun_within(captured: CapturedScene, region: BoundingSphere, decisive: float) -> Sun | None:
-    shown = _ShadowEvidence.of(captured, region)
-    if shown is None:
-        return None
+def _shown_sun(shown: _ShadowEvidence, region: BoundingSphere, decisive: float) -> Sun | None:
     direction, evidence = shown.best(shown.above(_DIRECTIONS))
     if evidence < decisive:
         return None
@@ -489,7 +492,8 @@ def sun_near(
         The sun in the mean direction, with the standard error of that. Its ratio is None if no surface clearly shows
         its shadow.
     """
-    surfaces = _ShadowEvidence.on_surfaces(captured, replace(region, radius=_WIDER * region.radius), most=SURFACES)
+    wider = replace(region, radius=_WIDER * region.radius)
+    surfaces = list(_ShadowEvidence.on_surfaces(captured, wider, most=SURFACES))
     probable = log_density > -math.inf
     for one in surfaces:
         probable &= directions @ one.surface.plane.normal > LOWEST_SINE
