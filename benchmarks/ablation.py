@@ -261,6 +261,10 @@ def changed_sun(captured: CapturedScene, region: Any, *, outdoors: bool, **chang
     return None if sun is None else replace(sun, **changes)
 
 
+def sun_on_one_surface(captured: CapturedScene, region: Any, *, outdoors: bool) -> Sun | None:
+    return find_sun(captured, region)
+
+
 def no_sun_by_shading(captured: CapturedScene, main: Any, sky: Any, *, outdoors: bool, is_unseen: bool) -> Any:
     return known_sun(captured, main, sky, outdoors=False, is_unseen=is_unseen)
 
@@ -548,6 +552,14 @@ ROWS: Mapping[str, Row] = {
         "sun",
         "the brightest unseen source out of doors is the sun",
         {"relighting.light.estimate.known_sun": no_sun_by_shading},
+    ),
+    "sun-ground": Row(
+        "sun",
+        "shadows on a second surface and in a wider region, out of doors",
+        {"relighting.light.estimate.find_sun": sun_on_one_surface},
+    ),
+    "sun-height": Row(
+        "sun", "an error of the sun's height by a clear sky", {"relighting.light.sky._HEIGHT_SD_DEG": 0.1}
     ),
     "sun-sky": Row(
         "sun", "a clear sky shows sun and sky", {"relighting.light.estimate.clear_sky_evidence": lambda captured: None}
