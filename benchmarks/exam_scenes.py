@@ -8,6 +8,7 @@ from pathlib import Path
 from splatgraft.reconstruction import ReconstructOptions
 from splatgraft.runtime.console import Console
 from splatgraft_paper.exam.scenes import ExamScene, read_scene
+from splatgraft_paper.synthesis.places import OUTDOORS
 
 RECONSTRUCTION = ReconstructOptions(iterations=1000, budget=20_000)
 
@@ -26,3 +27,8 @@ def scenes_in(options: argparse.Namespace) -> Iterator[tuple[str, Callable[[], E
         for path in sorted(p for p in folder.iterdir() if (p / "probe.npy").is_file()):
             name = f"{folder.resolve().parent.name}-{path.name}"
             yield name, partial(read_scene, path, work / path.name, RECONSTRUCTION, Console())
+
+
+def is_outdoors(name: str) -> bool:
+    """Return whether a scene with this name is out of doors."""
+    return any(kind in name for kind in OUTDOORS)

@@ -15,14 +15,13 @@ import statistics
 from unittest import mock
 
 import torch
-from exam_scenes import scene_arguments, scenes_in
+from exam_scenes import is_outdoors, scene_arguments, scenes_in
 from torch import Tensor
 
 from splatgraft.core.images import LUMINANCE
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.sky import SkyEvidence, suns_above
-from splatgraft_paper.synthesis.places import OUTDOORS
 
 _HAZY = 2.0
 _UP = torch.tensor([[0.0, 0.0, 1.0]])
@@ -53,7 +52,7 @@ def main() -> None:
     """Fit and print."""
     constants, tints, scores = [], [], []
     for name, read in scenes_in(scene_arguments(__doc__).parse_args()):
-        if not set(OUTDOORS) & set(name.replace("-", "_").split("_")):
+        if not is_outdoors(name):
             continue
         scene = read()
         found = strength_and_tint(name, scene.new_light)
@@ -68,11 +67,8 @@ def main() -> None:
     print(f"{len(constants)} clear skies: ratio {math.exp(statistics.mean(constants)):.1f} times the sine", end=", ")
     print(f"standard deviation of its logarithm {statistics.stdev(constants):.2f}, tint {[round(x, 2) for x in tint]}")
     print(f"log density of the true sun, mean of {len(scores)} skies seen as clear, by the height's error in degrees:")
-    print(
-        ", ".join(
-            f"{e:g}: {statistics.mean(s):.2f}" for e, s in zip(_ERRORS_DEG, zip(*scores, strict=True), strict=True)
-        )
-    )
+    means = map(statistics.mean, zip(*scores, strict=True))
+    print(", ".join(f"{error:g}: {mean:.2f}" for error, mean in zip(_ERRORS_DEG, means, strict=True)))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from exam_scenes import scene_arguments, scenes_in
+from exam_scenes import is_outdoors, scene_arguments, scenes_in
 from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere, bounding_sphere
@@ -27,7 +27,6 @@ from splatgraft.relighting.light.estimate import region_around
 from splatgraft.relighting.light.light import Light
 from splatgraft.relighting.light.sun import _DECISIVE, _DIRECTIONS, Sun, _ShadowEvidence, find_sun
 from splatgraft_paper.exam.scenes import ExamScene
-from splatgraft_paper.synthesis.places import OUTDOORS
 
 _BARS = (15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0)
 _NEAR_DEG = 5.0
@@ -144,7 +143,7 @@ def main() -> None:
     parser = scene_arguments(__doc__)
     parser.add_argument("--plot", type=Path, help="SVG of the likelihoods of right and wrong directions")
     options = parser.parse_args()
-    found, points = list[Judged](), list[tuple[float | None, float]]()
+    found, points = {bar: list[Judged]() for bar in _BARS}, list[tuple[float | None, float]]()
     places = 0
     for name, read in scenes_in(options):
         for suffix, whole, cameras, place, truth in places_of(read()):
@@ -155,19 +154,21 @@ def main() -> None:
                 points.append(compared)
                 right = "-" if compared[0] is None else f"{compared[0]:.0f}"
                 print(f"{name + suffix:28s} near a strong source {right}, elsewhere {compared[1]:.0f}", flush=True)
-            outdoors = not suffix and any(kind in name for kind in OUTDOORS)
-            sun = find_sun(captured, region, outdoors=outdoors, decisive=min(_BARS))
-            if sun is None:
-                continue
-            one = judge(sun, truth)
-            found.append(one)
-            where = f"{name + suffix:28s} evidence {sun.evidence:4.0f}   off {one.off_deg:5.1f} degrees"
-            print(f"{where}   strength {one.ratio:.2f} (true {one.true_ratio:.2f})", flush=True)
+            sun, outdoors = None, not suffix and is_outdoors(name)
+            for bar in _BARS:
+                if sun is None or sun.evidence < bar:  # another surface may have more
+                    sun = find_sun(captured, region, outdoors=outdoors, decisive=bar)
+                    if sun is None:
+                        break
+                    one = judge(sun, truth)
+                    where = f"{name + suffix:28s} evidence {sun.evidence:4.0f}   off {one.off_deg:5.1f} degrees"
+                    print(f"{where}   strength {one.ratio:.2f} (true {one.true_ratio:.2f})", flush=True)
+                found[bar].append(judge(sun, truth))
     if points:
         plot(points, options.plot)
     print(f"{places} places")
     for bar in _BARS:
-        over = [one for one in found if one.sun.evidence >= bar]
+        over = found[bar]
         logs = sorted(abs(math.log(one.ratio / one.true_ratio)) for one in over if one.is_right and one.true_ratio > 0)
         error = f", median error of the strength a factor of {math.exp(logs[len(logs) // 2]):.2f}" if logs else ""
         print(f"bar {bar:3.0f}: {sum(one.is_right for one in over)} right of {len(over)}{error}")

@@ -92,14 +92,13 @@ def known_sun(
     directions = suns_above(captured.up)
     log_density = torch.zeros(len(directions)) if sky is None else sky.log_density(directions)
     clock = captured.clock if len(clock_directions(captured.clock)) else None
-    may_be_sun = (
-        main is not None and not math.isfinite(main.distance) and (clock is not None or (outdoors and is_unseen))
-    )
-    if clock is None and sky is None and not may_be_sun:
+    if main is not None and (math.isfinite(main.distance) or (clock is None and not (outdoors and is_unseen))):
+        main = None  # it cannot be the sun
+    if clock is None and sky is None and main is None:
         return None
     if clock is not None:
         log_density = log_density + _by_clock(directions, clock)
-    if main is not None and may_be_sun:
+    if main is not None:
         wrong = 0.0 if clock is None and sky is None else _SHADING_IS_WRONG
         towards = torch.tensor([main.direction])
         log_density = log_density + prior_near(towards, main.uncertainty_deg, wrong=wrong)(directions)

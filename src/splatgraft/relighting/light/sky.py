@@ -4,7 +4,7 @@ A clear sky is brighter around the sun and towards the horizon. The models are t
 (types 11 to 15). The brightness of the whole sky is unknown. Views also show other things above the horizon, such as
 trees, so each direction shows either the sky or something of any brightness.
 
-These skies place the sun well in azimuth. In height real ones differ from them, so its height has an error of its own.
+The sun's azimuth is sharp by these skies. Its height has a standard error, because other skies differ from the models.
 """
 
 import math
@@ -92,7 +92,7 @@ class SkyEvidence:
     colors: Float[Tensor, "b 3"]
     """Linear rgb of the pixel of median luminance."""
     clipped: Bool[Tensor, "b"]
-    """Whether the cell is clipped, so that it may be brighter."""
+    """Whether the cell is clipped; its true luminance is then unknown, but not lower."""
     up: Float[Tensor, "3"]
     """Unit up direction of the scene."""
 

@@ -10,8 +10,8 @@
    is mixed with the chance that something unseen shades a texel, or a whole tile of the picture.
 4. Refine the best directions, then fit angular radius and strength at the edges of the shadows.
 5. Compare the sun with lamps at a few heights, whose shadows diverge.
-6. If no direction is decisively better than no sun, do the same within the cameras' median distance. Out of doors the
-   next level surface, such as the ground around a table, is searched, too, and the wider region is larger.
+6. If no direction is decisively better than no sun, do the same within the cameras' median distance. Out of doors this
+   wider region is larger, and the second level surface is searched, too, such as the ground around a table.
 
 Where a sun is known to exist, `sun_near` moves it to the shadows of several surfaces.
 
@@ -417,7 +417,8 @@ def find_sun(
     Args:
         captured: The scene with all objects that cast shadows during the capture.
         region: Sphere around the place that contains the surfaces and the occluders on them.
-        outdoors: Whether to search more surfaces in a wider region. In a room their shadows may show a false sun.
+        outdoors: Whether to search two surfaces in each region, and to enlarge the wider one. In rooms this finds false
+            suns.
         decisive: Minimum log likelihood over that of no sun.
 
     Returns:
@@ -434,6 +435,7 @@ def find_sun(
 
 
 def _shown_sun(shown: _ShadowEvidence, region: BoundingSphere, decisive: float) -> Sun | None:
+    """Find the sun, or the lamp as seen from the region's centre, whose shadows a surface shows; None without one."""
     direction, evidence = shown.best(shown.above(_DIRECTIONS))
     if evidence < decisive:
         return None
