@@ -5,6 +5,9 @@
 SCENES are folders of scenes that `splatgraft paper exam` rendered; both places of each count. A sun is right if it lies
 within 5 degrees of the disc of a true source. The source must give a fifth of the irradiance on the surface or more.
 
+Gaussians mix lit and shaded ground, so the edge of a shadow shows shade over lit ground brighter than it was. The error
+has an asymmetric Laplace density, whose two means are fitted to the right suns over the bar of `find_sun`.
+
 The plot has one point for each place: the largest log likelihood of a direction within 15 degrees of such a source, and
 of any other direction.
 """
@@ -54,6 +57,14 @@ class Judged:
         """Strength that the shadows show."""
         assert self.sun.ratio is not None
         return float(self.sun.ratio @ LUMINANCE)
+
+
+def mean_errors(suns: Sequence[Judged]) -> tuple[float, float]:
+    """Fit the mean errors of shade over lit ground, brighter and darker, of some suns (maximum likelihood)."""
+    errors = [1 / (1 + one.ratio) - 1 / (1 + one.true_ratio) for one in suns]
+    brighter, darker = (sum(max(sign * error, 0.0) for error in errors) / len(errors) for sign in (1, -1))
+    both = math.sqrt(brighter * darker)
+    return brighter + both, darker + both
 
 
 def judge(sun: Sun, truth: Light) -> Judged:
@@ -172,6 +183,10 @@ def main() -> None:
         logs = sorted(abs(math.log(one.ratio / one.true_ratio)) for one in over if one.is_right and one.true_ratio > 0)
         error = f", median error of the strength a factor of {math.exp(logs[len(logs) // 2]):.2f}" if logs else ""
         print(f"bar {bar:3.0f}: {sum(one.is_right for one in over)} right of {len(over)}{error}")
+    right = [one for one in found[_DECISIVE] if one.is_right]
+    if right:
+        brighter, darker = mean_errors(right)
+        print(f"mean errors of shade over lit ground: {brighter:.2f} brighter, {darker:.2f} darker")
 
 
 if __name__ == "__main__":

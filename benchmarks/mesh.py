@@ -6,6 +6,7 @@
 A SCENE is a folder with target/, probe.npy, suns.json and scene.json; WORK/target/scene is its reconstruction. --draw
 draws and renders new scenes, which are used once. Rows: pasted (base colours as they are), the given (true) light, the
 estimated light. PSNR of the object's pixels, and error of the shadow's ratio, in views outside the reconstruction.
+--scale makes these pictures larger than the captured ones.
 """
 
 import argparse
@@ -36,13 +37,12 @@ from splatgraft_paper.benchmark.true_light import read_probe
 from splatgraft_paper.exam.measure import light_errors, measure_row
 from splatgraft_paper.exam.scenes import SIZE, TrueView, draw_scenes
 from splatgraft_paper.synthesis import benchmark
-from splatgraft_paper.synthesis.jobs import Job, Model, Take, render_job
+from splatgraft_paper.synthesis.jobs import Job, Model, RenderSize, Take, render_job
 from splatgraft_paper.synthesis.places import make_scene
 from splatgraft_paper.synthesis.scene import Camera, Place
 
 KINDS = ("matte", "glossy", "metal", "painted", "thin", "concave")
 VIEWS = 2  # held-out views of each scene
-BUDGET = 15_000  # Gaussians of a mesh, which is about 100 pixels wide in the pictures
 BLENDER_FROM_RDF = torch.tensor([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]])
 """Rotation from the axes in which a mesh is read to those in which Blender's importer places it."""
 
@@ -76,22 +76,24 @@ def reconstructed(folder: Path, work: Path) -> Gaussians:
     return read_gaussians(scene)
 
 
-def true_pictures(folder: Path, meshes: Path, out: Path, python: Path) -> tuple[Path, list[int]]:
+def true_pictures(
+    folder: Path, cameras: Cameras, size: RenderSize, options: argparse.Namespace
+) -> tuple[Path, list[int]]:
     """Render held-out views without and with each mesh; returns the takes' folder and the views' numbers."""
     record = json.loads((folder / "scene.json").read_text())
     scene = make_scene(record["kind"], record["seed"])
-    place, cameras = scene.places[0], read_cameras(folder / "target")
+    place, meshes = scene.places[0], options.out / "meshes"
     chosen = held_out(len(cameras), HELD_OUT_EVERY).nonzero()[:VIEWS, 0].tolist()
     # the first take gives the exposure, as in the scene's own pictures
     takes = [Take("without", scene=True)]
     takes += [Take(kind, scene=True, object=kind, passes=("color", "mask")) for kind in KINDS]
-    rendered = out / "truth" / folder.name
+    rendered = options.out / "truth" / folder.name
     for take in takes:  # other views count as done
         (rendered / take.name).mkdir(parents=True, exist_ok=True)
         for index in set(range(len(cameras))) - set(chosen):
             (rendered / take.name / f"{index:04d}.done").touch()
     models = {kind: Model(str((meshes / f"{kind}.glb").resolve()), height_at(place), place.location) for kind in KINDS}
-    render_job(Job(scene, models, _blender_cameras(cameras), tuple(takes), SIZE.render), rendered, python)
+    render_job(Job(scene, models, _blender_cameras(cameras), tuple(takes), size), rendered, options.blender_python)
     return rendered, chosen
 
 
@@ -104,15 +106,18 @@ def _blender_cameras(cameras: Cameras) -> tuple[Camera, ...]:
     return tuple(found)
 
 
-def measured(folder: Path, work: Path, meshes: Path, out: Path, python: Path) -> dict:
+def measured(folder: Path, work: Path, options: argparse.Namespace) -> dict:
     """Measure all kinds in a scene, and write a picture: pasted, given light, estimated light, truth."""
-    target, cameras = reconstructed(folder, work), read_cameras(folder / "target")
-    fitted = cameras[~held_out(len(cameras), HELD_OUT_EVERY)]
+    target, captured = reconstructed(folder, work), read_cameras(folder / "target")
+    fitted = captured[~held_out(len(captured), HELD_OUT_EVERY)]
+    cameras, meshes = captured.resized(options.scale), options.out / "meshes"
+    width, height = cameras.sizes[0].tolist()
     light = read_probe(folder / "probe.npy", folder / "suns.json")
     record = json.loads((folder / "scene.json").read_text())
     place = make_scene(record["kind"], record["seed"]).places[0]
     at, found, notes = torch.tensor(place.location), {}, []
-    rendered, chosen = true_pictures(folder, meshes, out, python)
+    size = replace(SIZE.render, width=width, height=height)
+    rendered, chosen = true_pictures(folder, cameras, size, options)
     for kind in KINDS:
         views = []
         for index in chosen:
@@ -122,7 +127,9 @@ def measured(folder: Path, work: Path, meshes: Path, out: Path, python: Path) ->
             views.append(TrueView(cameras[index], Truth(image=image, background=without, mask=mask), drawn))
         move = Similarity(height_at(place), BLENDER_FROM_RDF, at)
         composite = compose(
-            target, [read_scene(meshes / f"{kind}.glb", mesh_budget=BUDGET).gaussians], target_from_objects=[move]
+            target,
+            [read_scene(meshes / f"{kind}.glb", mesh_budget=options.budget).gaussians],
+            target_from_objects=[move],
         )
         scenes = {"pasted": composite.bake()[0]}
         for name, given in (("given", light), ("estimated", None)):
@@ -134,7 +141,7 @@ def measured(folder: Path, work: Path, meshes: Path, out: Path, python: Path) ->
         found[kind]["light"] = light_errors(relit.light, light)
         columns = [torch.cat([view.picture(scene) for view in views], 0) for scene in scenes.values()]
         truth = torch.cat([view.truth.image for view in views], 0)
-        write_image(out / "pictures" / f"{folder.name}_{kind}.png", torch.cat([*columns, truth], 1))
+        write_image(options.out / "pictures" / f"{folder.name}_{kind}.png", torch.cat([*columns, truth], 1))
         print(folder.name, kind, json.dumps(found[kind]), flush=True)
     return {"kinds": found, "notes": notes}
 
@@ -146,6 +153,8 @@ def main() -> None:
     parser.add_argument("--draw", type=int)
     parser.add_argument("--kinds", nargs="*", default=("kitchen", "garden"))
     parser.add_argument("--count", type=int, default=2)
+    parser.add_argument("--scale", type=float, default=2.0, help="width of a picture over that of a captured one")
+    parser.add_argument("--budget", type=int, default=60_000, help="number of Gaussians of a mesh")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--blender-python", type=Path, required=True)
     options = parser.parse_args()
@@ -159,7 +168,7 @@ def main() -> None:
         scenes += [drawn_scene(which, out, python) for which in drawn]
     results = {}
     for folder, work in scenes:
-        results[folder.name] = measured(folder, work, meshes, out, python)
+        results[folder.name] = measured(folder, work, options)
         (out / "mesh.json").write_text(json.dumps(results, indent=1))
 
 

@@ -23,9 +23,9 @@ from splatgraft.core.spherical_harmonics import dc_from_rgb, rgb_from_dc
 from splatgraft.formats import read_cameras, read_gaussians
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.description import describe_light
-from splatgraft.relighting.light.estimate import EstimatedLight, _source, estimate_light
+from splatgraft.relighting.light.estimate import EstimatedLight, _is_denied, _source, estimate_light
 from splatgraft.relighting.light.evidence import ShadingEvidence, find_highlights
-from splatgraft.relighting.light.known_sun import BY_CLOCK, sun_towards
+from splatgraft.relighting.light.known_sun import BY_CLOCK, clear_ratio, sun_towards
 from splatgraft.relighting.light.light import Light, LightSource, fit_ambient, light_confidence
 from splatgraft.relighting.light.panorama import (
     DIRECTIONS,
@@ -34,9 +34,11 @@ from splatgraft.relighting.light.panorama import (
     cube_directions,
     nearest_directions,
     render_panorama,
+    shares_of,
     surroundings_at,
 )
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceSettings, radiance_problem
+from splatgraft.relighting.light.radiance_search import RadianceEstimate
 from splatgraft.relighting.light.sun import (
     _DIRECTIONS,
     SET_BY_HAND,
@@ -531,8 +533,25 @@ def test_a_room_ends_at_its_walls_and_a_garden_does_not(near_height, outdoors):
     bright, patch = replace(evidence, far=clipped, around=clipped), torch.arange(len(DIRECTIONS)) == 200
     assert float(far.distance[patch]) < 20
     assert _source(patch, torch.ones(1, 3), bright, within=1.0).name == ("bright patch" if outdoors else "window")
-    named = replace(estimate_of(under_sun()), evidence=evidence).with_sun(Sun(SUN, 0.3, UP, torch.ones(3), 50.0), scene)
+    found = estimate_of(under_sun())
+    near = LightSource((0.0, 0.6, 0.8), (1.0, 1.0, 1.0), 5.0, distance=4.0)
+    found = replace(found, evidence=evidence, mean=replace(found.mean, sources=(near,)))
+    named = found.with_sun(Sun(SUN, 0.3, UP, torch.ones(3), 50.0), scene)
     assert named.light.sources[0].name == ("sun" if outdoors else "sun or window")
+    # out of doors the sun replaces what looked like a near source; in a room a lamp stays
+    assert len(named.light.sources) == (1 if outdoors else 2)
+    assert float(named.light.irradiance(UP[None]).mean()) == pytest.approx(
+        float(found.mean.irradiance(UP[None]).mean())
+    )
+
+
+def test_hedges_just_above_the_horizon_do_not_make_a_square_a_room():
+    sine = DIRECTIONS @ UP
+    distance = torch.where(sine < 0.04, 1.0, torch.where(sine < 0.2, 1.5, 1.6))  # paving, hedges, trees
+    around = replace(surroundings(torch.zeros(len(DIRECTIONS))), seen=(sine.abs() < 0.4).float(), distance=distance)
+    assert LightEvidence(receivers(torch.zeros(1, 3)), None, around, around, UP).is_outdoors
+    wall = replace(around, distance=1 / (1 - sine.square()).sqrt())
+    assert not LightEvidence(receivers(torch.zeros(1, 3)), None, wall, wall, UP).is_outdoors
 
 
 def test_shading_and_highlights_show_how_strong_a_sun_in_a_known_direction_is():
@@ -547,8 +566,66 @@ def test_shading_and_highlights_show_how_strong_a_sun_in_a_known_direction_is():
     assert bright.error_deg == 5.0
     # 3 times the sine of the height is 1.6. Shading alone leaves a factor open: the estimate's even light holds a part
     assert 0.2 < float(bright.ratio @ LUMINANCE) / (3 * float(SUN[2])) < 4
-    # under an even sky the sun is hidden, or at least weak
-    assert hidden is None or float(hidden.ratio @ LUMINANCE) < 0.3 * float(bright.ratio @ LUMINANCE)
+    # under an even sky the sun is hidden, or at least weak: matt surfaces alone tell little
+    assert hidden is None or float(hidden.ratio @ LUMINANCE) < 0.6 * float(bright.ratio @ LUMINANCE)
+
+
+def strength_of(sun, found):
+    """Return a sun's estimated strength."""
+    estimated = sun_towards(sun, None, radiance_problem(found.evidence), found.evidence, found.rest())
+    return 0.0 if estimated is None else float(estimated.ratio @ LUMINANCE)
+
+
+def test_the_edge_of_a_shadow_bounds_the_strength_of_a_sun_from_below():
+    measured = Sun(SUN, 0.4, UP, torch.tensor([1.2, 1.0, 0.7]), 50.0)
+    edge = float(measured.ratio @ LUMINANCE)
+    found = estimate_of(under_sky())
+    unmeasured = strength_of(replace(measured, ratio=None), found)
+    assert unmeasured < 0.3 * edge  # the surfaces show no sun
+    assert 0.8 * edge < strength_of(measured, found) < 2 * edge
+    estimated = sun_towards(measured, None, radiance_problem(found.evidence), found.evidence, found.rest())
+    assert (estimated.ratio / estimated.ratio[1]).tolist() == pytest.approx([1.2, 1.0, 0.7])
+    assert estimated.radius_deg == 0.4
+
+
+def test_a_sun_about_which_nothing_is_known_has_the_median_strength():
+    found = estimate_of(under_sky())
+    black = replace(found.evidence.surfaces, weights=torch.zeros_like(found.evidence.surfaces.weights))
+    nothing = replace(found.evidence, surfaces=black, highlights=None)
+    sun = Sun(SUN, 1.0, UP, None, 0.0)
+    estimated = sun_towards(sun, None, radiance_problem(nothing), nothing, found.rest())
+    clear = float(clear_ratio(float(SUN @ UP)) @ LUMINANCE)
+    assert estimated is not None
+    # a clear sky is as likely as all weaker suns together
+    assert 0.3 * clear < float(estimated.ratio @ LUMINANCE) < 0.9 * clear
+
+
+def test_a_source_that_surfaces_deny_is_spread_over_unseen_directions():
+    x, y, z = SUN.tolist()
+    for captured, is_denied in ((under_sun(), False), (under_sky(), True)):
+        found = estimate_of(captured)
+        even = found.rest().mean() * math.pi
+        source = LightSource((x, y, z), (float(even),) * 3, 1.0)
+        problem = radiance_problem(found.evidence)
+        assert _is_denied(source, problem, found.evidence, found.rest()) == is_denied
+    k, seen = len(DIRECTIONS), (DIRECTIONS[:, 2] < 0).float()
+    lamp = torch.ones(k, 3)
+    at = int((DIRECTIONS @ SUN).argmax())
+    lamp[at] = 30.0
+    spread = RadianceEstimate(unseen=lamp, clipped=torch.zeros(k, 3), residual=torch.zeros(0)).spread(seen).unseen
+    above = DIRECTIONS[:, 2] > 0
+    assert float(spread[above].max()) < 4
+    assert float(spread[above].sum()) == pytest.approx(float(lamp[above].sum()), rel=0.1)
+    assert float(spread[at].mean()) == pytest.approx(float(spread[above].max()), rel=0.2)
+
+
+def test_a_source_between_directions_is_divided_among_the_three_around_it():
+    for direction in even_directions(50):
+        shares = shares_of(direction)
+        assert int((shares > 0).sum()) <= 3
+        assert float(shares.sum()) == pytest.approx(1)
+        assert degrees_apart(torch.nn.functional.normalize(shares @ DIRECTIONS, dim=0), direction) < 2
+    assert float(shares_of(DIRECTIONS[7])[7]) == pytest.approx(1, abs=1e-4)
 
 
 @pytest.mark.long

@@ -1,7 +1,8 @@
 """Estimate of the light at a place of a scene from its panorama and from shadows and highlights on the surfaces around.
 
 1. Collect the evidence: panorama, shading of surfaces, highlights.
-2. Find the radiance of 320 directions that explains it (`radiance_search.py`).
+2. Find the radiance of 320 directions that explains it (`radiance_search.py`). If it is likelier without the brightest
+   source that no camera saw, spread the radiance of unseen directions.
 3. Turn peaks of that radiance into sources, and the rest into ambient light of degree 2.
 4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it. Otherwise replace them by the
    sun that is known from the photos' clock or, out of doors, from a clear sky or as the brightest source that no camera
@@ -39,8 +40,8 @@ from splatgraft.relighting.light.panorama import (
     place_surroundings,
     surroundings_at,
 )
-from splatgraft.relighting.light.radiance_model import LightEvidence, radiance_problem
-from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance
+from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceProblem, radiance_problem
+from splatgraft.relighting.light.radiance_search import RadianceEstimate, search_radiance, source_costs
 from splatgraft.relighting.light.sky import ClearSky, clear_sky_evidence
 from splatgraft.relighting.light.sun import (
     UNSEEN_RADIUS_DEG,
@@ -126,9 +127,13 @@ class EstimatedLight:
         named = replace(sun, name=sun.name or ("lamp" if math.isfinite(sun.distance) else self._name_at(sun.direction)))
         if self.sky is not None and sun.ratio is None:
             named = replace(named, ratio=clear_ratio(float(sun.direction @ self.sky.up)))
-        lit = with_sun(self.mean, named, is_added=self.sky is not None)
+        mean = self.mean
+        if self.evidence.is_sun(sun.distance):
+            # by day nothing else is a source, so the sun replaces near ones, too
+            mean = replace(mean, sources=tuple(replace(source, distance=math.inf) for source in mean.sources))
+        lit = with_sun(mean, named, is_added=self.sky is not None)
         blockers_within = with_blocker_distances(lit, scene, self.place).sources[0].blockers_within
-        return replace(self, found_sun=replace(named, blockers_within=blockers_within))
+        return replace(self, mean=mean, found_sun=replace(named, blockers_within=blockers_within))
 
     def _name_at(self, direction: Float[Tensor, "3"]) -> str:
         """Name a distant source found from shadows.
@@ -192,6 +197,9 @@ def estimate_light(
     problem = radiance_problem(evidence)
     hidden = search_radiance(problem)
     sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
+    if sources and sources[0].name in _UNSEEN_NAMES and _is_denied(sources[0], problem, evidence, rest):
+        hidden = hidden.spread(evidence.far.seen)
+        sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
     sky = clear_sky_evidence(captured) if evidence.is_outdoors else None
     known = None
     sun = set_sun(sun_through, whole) if sun_through else find_sun(whole, region, outdoors=evidence.is_outdoors)
@@ -204,9 +212,8 @@ def estimate_light(
     if clear is not None and sun is not None:
         hidden = hidden.under(clear)
         sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
-        # the sky tells the strength better than the edges of shadows, where Gaussians mix lit and shaded
-        sun = replace(sun, ratio=None, name=sun.name or "sun")
-    if known is not None and sun is not None and sun.ratio is None:
+        sun = replace(sun, ratio=None if sun_through else sun.ratio, name=sun.name or "sun")
+    if sun is not None and not sun_through and (sun.ratio is None or evidence.is_sun(sun.distance)):
         sun = sun_towards(sun, sky, problem, evidence, rest)
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     ground = None if sun is None or sun_through or not evidence.is_outdoors else OpenGround.around(whole, region, sun)
@@ -248,6 +255,15 @@ def _split_peaks(
         sources.append(_source(group, (radiance[group] - background).clamp_min(0), evidence, within=within))
         rest[group] = torch.minimum(rest[group], background)
     return tuple(sorted(sources, key=lambda source: -source.luminance)), rest
+
+
+def _is_denied(
+    source: LightSource, problem: RadianceProblem, evidence: LightEvidence, rest: Float[Tensor, "k 3"]
+) -> bool:
+    """Return whether shading and highlights are likelier without a source than with it."""
+    added = torch.tensor([0.0, sum(source.irradiance) / 3 / SOLID_ANGLE], dtype=torch.float64)
+    without, with_it = source_costs(problem, evidence, rest.mean(1), torch.tensor(source.direction), added).tolist()
+    return with_it > without
 
 
 def _ambient_of(rest: Float[Tensor, "k 3"]) -> Float[Tensor, "9 3"]:

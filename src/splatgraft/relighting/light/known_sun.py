@@ -7,9 +7,11 @@ Clouds or walls may still hide the sun. So the sun's strength, its irradiance on
 all other light, has a posterior:
 
 - The likelihood is that of the shading and the highlights (`radiance_model.py`), for one source over the light that the
-  estimate has beside its sources.
-- The prior is a mixture. Under a clear sky the strength is known from the sun's height; otherwise every strength up to
-  that is as likely, on a logarithmic scale.
+  estimate has beside its sources. If the edge of a shadow was measured, its likelihood is a factor.
+- The prior is a mixture. Under a clear sky the strength is known from the sun's height; otherwise every share of all
+  light up to that is as likely.
+
+The estimate is the median. The maximum would be a clear sky's strength wherever the likelihood says nothing.
 
 A tree that no view shows may shade a place from a sun that shines beside it. The ground around the place tells
 (`OpenGround`).
@@ -29,6 +31,7 @@ from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.light import LightSource
 from splatgraft.relighting.light.panorama import DIRECTIONS
 from splatgraft.relighting.light.radiance_model import LightEvidence, RadianceProblem
+from splatgraft.relighting.light.radiance_search import source_costs
 from splatgraft.relighting.light.sky import SkyEvidence, suns_above
 from splatgraft.relighting.light.sun import (
     ERROR_DEG,
@@ -46,13 +49,16 @@ _CLEAR = 11.2  # strength of the sun over the sine of its height
 _CLEAR_SD = 0.26  # standard deviation of the logarithm of that
 _TINT = (1.34, 0.97, 0.58)  # strength in red, green and blue over that in luminance
 
+# the edge of a shadow, fitted by benchmarks/fit_sun.py
+_SHADE_IS_BRIGHTER, _SHADE_IS_DARKER = 0.09, 0.03
+"""Mean errors of the brightness of shade over that of lit ground. Gaussians mix both, so shade looks brighter."""
+
 # set by hand
 _IS_CLEAR, _SEEN_IS_CLEAR = 0.5, 0.9  # probability of a clear sky if the views do not show one, and if they do
 _SHADING_IS_WRONG = 0.3  # probability that the brightest source is not the sun, beside other evidence
 _STRENGTHS = torch.logspace(-2, 1.4, 35, dtype=torch.float64)
 _LEAST = 0.1  # strength below which the sun is hidden
 _SUN_RADIUS_DEG = 0.27
-_ROUNDS = 8  # iterations of reweighting
 
 # a shade that nothing captured casts; set by hand
 _AT_PLACE = 1.5  # object radii from the object's middle within which ground is at its place
@@ -132,7 +138,7 @@ def sun_towards(
     """Estimate the strength of a sun in a known direction.
 
     Args:
-        sun: The sun; its ratio is not read.
+        sun: The sun. Its ratio is that of a shadow's edge; None if none was measured.
         sky: A clear sky; None if the views do not show one.
         problem: Density of the light at the place.
         evidence: Evidence that `problem` is made of.
@@ -142,11 +148,24 @@ def sun_towards(
         The sun with its ratio; None if the evidence is against a sun there.
     """
     log_posterior = _log_prior(float(sun.direction @ evidence.up), _IS_CLEAR if sky is None else _SEEN_IS_CLEAR)
-    log_posterior -= _costs(problem, evidence, rest, sun.direction) / problem.settings.temperature
-    strength = float(_STRENGTHS[log_posterior.argmax()])
-    if strength < _LEAST:
-        return None
-    return replace(sun, radius_deg=_SUN_RADIUS_DEG, ratio=strength * torch.tensor(_TINT))
+    gray, sines = rest.mean(1).double(), (DIRECTIONS @ evidence.up).clamp_min(0).double()
+    # radiance of one direction that gives the sun's irradiance on level ground
+    added = _STRENGTHS * (sines @ gray) / max(float(sun.direction @ evidence.up), LOWEST_SINE)
+    log_posterior -= source_costs(problem, evidence, gray, sun.direction, added) / problem.settings.temperature
+    radius_deg, tint = _SUN_RADIUS_DEG, torch.tensor(_TINT)
+    if sun.ratio is not None:
+        measured = float(sun.ratio @ LUMINANCE)
+        log_posterior += _edge_log_likelihood(measured)
+        radius_deg, tint = sun.radius_deg, sun.ratio / measured
+    median = int((log_posterior.softmax(0).cumsum(0) < 0.5).sum())
+    strength = float(_STRENGTHS[median])
+    return None if strength < _LEAST else replace(sun, radius_deg=radius_deg, ratio=strength * tint)
+
+
+def _edge_log_likelihood(measured: float) -> Float[Tensor, "r"]:
+    """Compute the log likelihood of each of `_STRENGTHS`, up to a constant, if a shadow's edge shows `measured`."""
+    brighter = 1 / (1 + measured) - 1 / (1 + _STRENGTHS)  # shade over lit ground, less the true one
+    return torch.where(brighter > 0, -brighter / _SHADE_IS_BRIGHTER, brighter / _SHADE_IS_DARKER)
 
 
 @dataclass(frozen=True)
@@ -211,28 +230,5 @@ def _log_prior(sine: float, is_clear: float) -> Float[Tensor, "r"]:
     """Return the log prior of `_STRENGTHS` for a sun whose height has this sine, and a probability of a clear sky."""
     clear = _CLEAR * max(sine, LOWEST_SINE)
     of_clear = torch.exp(-0.5 * ((_STRENGTHS / clear).log() / _CLEAR_SD) ** 2)
-    weaker = (clear >= _STRENGTHS).double()
+    weaker = (clear >= _STRENGTHS) * _STRENGTHS / (1 + _STRENGTHS).square()  # an even density of the sun's share
     return (is_clear * of_clear / of_clear.sum() + (1 - is_clear) * weaker / weaker.sum() + 1e-12).log()
-
-
-def _costs(
-    problem: RadianceProblem,
-    evidence: LightEvidence,
-    rest: Float[Tensor, "k 3"],
-    direction: Float[Tensor, "3"],
-) -> Float[Tensor, "r"]:
-    """Compute the negative log likelihood of each of `_STRENGTHS`, up to a constant."""
-    gray, sines = rest.mean(1).double(), (DIRECTIONS @ evidence.up).clamp_min(0).double()
-    at = int((DIRECTIONS @ direction).argmax())
-    # radiance of the direction that gives the sun's irradiance on level ground
-    added = _STRENGTHS * (sines @ gray) / sines[at].clamp_min(LOWEST_SINE)
-    surfaces = evidence.surfaces
-    transport, of_sun = surfaces.transport(evidence.far.distance).double(), surfaces.transport()[:, at].double()
-    mean_color = (surfaces.weights[:, None] * surfaces.colors).sum(0).mean()
-    white = transport @ gray + (1 - transport.sum(1)).clamp_min(0) * mean_color
-    received = (white[:, None] + of_sun[:, None] * added).clamp_min(1e-5)
-    costs = problem.refitted_cost(problem.log_color[:, None] - received.log(), rounds=_ROUNDS)
-    if problem.highlights is not None:
-        explained = problem.highlights.explained_with_more(gray, torch.full((len(added),), at), added)
-        costs = costs + problem.settings.highlights * torch.log1p(-explained).double()
-    return costs

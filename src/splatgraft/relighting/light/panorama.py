@@ -238,6 +238,13 @@ def surroundings_at(scene: Gaussians, cameras: Cameras, center: Float[Tensor, "3
     )
 
 
+def shares_of(direction: Float[Tensor, "3"]) -> Float[Tensor, "k"]:
+    """Divide a unit direction among the three nearest of the `DIRECTIONS`, whose mean it is with these shares."""
+    three = (DIRECTIONS @ direction).topk(3).indices
+    shares = torch.linalg.lstsq(DIRECTIONS[three].T, direction[:, None]).solution[:, 0].clamp_min(0)
+    return torch.zeros(len(DIRECTIONS)).index_add(0, three, shares / shares.sum())
+
+
 def nearest_directions(towards: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
     """Return the position in `DIRECTIONS` nearest to each unit direction, by a table with cells of 1.4 degrees."""
     return _nearest_table()[cube_pixels(towards, _TABLE)]

@@ -4,6 +4,8 @@
 2. Try single unseen or clipped directions as additional lamps; polish the best.
 3. Average the maxima, weighted by their density.
 4. Spread each unseen lamp over the directions that explain the scene about equally well.
+
+`source_costs` compares strengths of one source alone.
 """
 
 import itertools
@@ -14,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatgraft.relighting.light.panorama import DIRECTIONS, SOLID_ANGLE
+from splatgraft.relighting.light.panorama import DIRECTIONS, SOLID_ANGLE, shares_of
 from splatgraft.relighting.light.radiance_model import (
     ClippedPrior,
     LightEvidence,
@@ -31,6 +33,7 @@ _MIN_SHARE = 0.1  # minimum unknown share of a direction that may contain a lamp
 _STRENGTHS = (4.0, 12.0, 40.0, 120.0)  # radiance of a lamp over the previous radiance
 _APART = math.radians(18)  # minimum angle between two directions that are tried as lamps
 _SPREAD = math.radians(35)  # maximum angle over which the direction of a lamp is uncertain
+_ROUNDS = 8  # iterations of reweighting
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,47 @@ class RadianceEstimate:
             unseen=torch.where(above, radiance, self.unseen),
             clipped=torch.where(above, clipped, self.clipped),
         )
+
+    def spread(self, seen: Float[Tensor, "k"]) -> "RadianceEstimate":
+        """Average the radiance of each direction's unseen part over the directions around it.
+
+        Args:
+            seen: Seen share of each of the `DIRECTIONS`.
+        """
+        away = (DIRECTIONS @ DIRECTIONS.T).clamp(-1, 1).acos() / _SPREAD
+        weight = (-0.5 * away.square()).exp() * (1 - seen).clamp_min(1e-6)
+        return replace(self, unseen=weight @ self.unseen / weight.sum(1, keepdim=True))
+
+
+def source_costs(
+    problem: RadianceProblem,
+    evidence: LightEvidence,
+    rest: Float[Tensor, "k"],
+    direction: Float[Tensor, "3"],
+    added: Float[Tensor, "r"],
+) -> Float[Tensor, "r"]:
+    """Compute the negative log likelihood of one source of each radiance, up to a constant.
+
+    Level and albedos are the best ones for each.
+
+    Args:
+        problem: Density of the light at the place.
+        evidence: Evidence that `problem` is made of.
+        rest: Gray radiance from all `DIRECTIONS` without the source.
+        direction: Unit vector towards the source.
+        added: Gray radiance of the source, if it fills one of the `DIRECTIONS`; double precision.
+    """
+    surfaces, rest, shares = evidence.surfaces, rest.double(), shares_of(direction)
+    transport, of_source = surfaces.transport(evidence.far.distance).double(), (surfaces.transport() @ shares).double()
+    mean_color = (surfaces.weights[:, None] * surfaces.colors).sum(0).mean()
+    white = transport @ rest + (1 - transport.sum(1)).clamp_min(0) * mean_color
+    received = (white[:, None] + of_source[:, None] * added).clamp_min(1e-5)
+    costs = problem.refitted_cost(problem.log_color[:, None] - received.log(), rounds=_ROUNDS)
+    if problem.highlights is not None:
+        lights = rest + added[:, None] * shares.double()
+        explained = torch.tensor([problem.highlights.explained(light) for light in lights], dtype=torch.float64)
+        costs = costs + problem.settings.highlights * torch.log1p(-explained)
+    return costs
 
 
 def search_radiance(problem: RadianceProblem) -> RadianceEstimate:
