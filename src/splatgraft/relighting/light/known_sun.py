@@ -50,7 +50,7 @@ _CLEAR_SD = 0.26  # standard deviation of the logarithm of that
 _TINT = (1.34, 0.97, 0.58)  # strength in red, green and blue over that in luminance
 
 # the edge of a shadow, fitted by benchmarks/fit_sun.py
-_SHADE_IS_BRIGHTER, _SHADE_IS_DARKER = 0.09, 0.03
+_SHADE_IS_BRIGHTER, _SHADE_IS_DARKER = 0.1, 0.04
 """Mean errors of the brightness of shade over that of lit ground. Gaussians mix both, so shade looks brighter."""
 
 # set by hand
