@@ -4,12 +4,12 @@
 2. Find the radiance of 320 directions that explains it (`radiance_search.py`). If it is likelier without the brightest
    source that no camera saw, spread the radiance of unseen directions.
 3. Turn peaks of that radiance into sources, and the rest into ambient light of degree 2.
-4. If shadows on a level surface show a sun (`sun.py`), replace the distant sources by it. Otherwise replace them by the
-   sun that is known from the photos' clock or, out of doors, from a clear sky or as the brightest source that no camera
-   saw (`known_sun.py`). It moves to the shadows and takes the strength that these show, or else the most probable one.
-   If the views show a clear sky (`sky.py`), the radiance that no camera saw is that of this sky, and the sun is added
-   to it with a clear sky's strength. In the shade of something that was not captured
-   (`known_sun.OpenGround`) there is no sun.
+4. If shadows on a level surface show a sun (`sun.py`), it replaces the distant sources, and out of doors all sources.
+   Otherwise they are replaced by the sun that is known from the photos' clock or, out of doors, from a clear sky or as
+   the brightest source that no camera saw (`known_sun.py`). It moves to the shadows. Out of doors its strength is the
+   median of a posterior; in a room it is what the shadows show, or else that median. If the views show a clear sky
+   (`sky.py`), the radiance that no camera saw is that of this sky, and the sun is added to it. In the shade of something
+   that was not captured (`known_sun.OpenGround`) there is no sun.
 5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
 """
 

@@ -107,7 +107,7 @@ class LightEvidence:
         return len(at) > 0 and len(above) > 0 and float(above.median()) > _OPEN * float(at.median())
 
     def is_sun(self, distance: float) -> bool:
-        """Whether a source at this distance whose shadows are seen is the sun, not a lamp or a window."""
+        """Whether a source at this distance that casts shadows is the sun; in a room it may be a window."""
         return self.is_outdoors and math.isinf(distance)
 
     @property
