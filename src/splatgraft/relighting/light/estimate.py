@@ -8,8 +8,8 @@
    Otherwise they are replaced by the sun that is known from the photos' clock or, out of doors, from a clear sky or as
    the brightest source that no camera saw (`known_sun.py`). It moves to the shadows. Out of doors its strength is the
    median of a posterior; in a room it is what the shadows show, or else that median. If the views show a clear sky
-   (`sky.py`), the radiance that no camera saw is that of this sky, and the sun is added to it. In the shade of something
-   that was not captured (`known_sun.OpenGround`) there is no sun.
+   (`sky.py`), the radiance that no camera saw is that of this sky, and the sun is added to it. In the shade of
+   something that was not captured (`known_sun.OpenGround`) there is no sun.
 5. Set the maximum distance of occluders that block each source, so that a pane does not block its window's light.
 """
 
