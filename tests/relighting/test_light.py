@@ -545,15 +545,6 @@ def test_a_room_ends_at_its_walls_and_a_garden_does_not(near_height, outdoors):
     )
 
 
-def test_hedges_just_above_the_horizon_do_not_make_a_square_a_room():
-    sine = DIRECTIONS @ UP
-    distance = torch.where(sine < 0.04, 1.0, torch.where(sine < 0.2, 1.5, 1.6))  # paving, hedges, trees
-    around = replace(surroundings(torch.zeros(len(DIRECTIONS))), seen=(sine.abs() < 0.4).float(), distance=distance)
-    assert LightEvidence(receivers(torch.zeros(1, 3)), None, around, around, UP).is_outdoors
-    wall = replace(around, distance=1 / (1 - sine.square()).sqrt())
-    assert not LightEvidence(receivers(torch.zeros(1, 3)), None, wall, wall, UP).is_outdoors
-
-
 def test_shading_and_highlights_show_how_strong_a_sun_in_a_known_direction_is():
     unmeasured = Sun(SUN, 1.0, UP, None, 0.0, 5.0, BY_CLOCK)
     bright, hidden = (

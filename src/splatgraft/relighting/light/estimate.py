@@ -212,9 +212,12 @@ def estimate_light(
     if clear is not None and sun is not None:
         hidden = hidden.under(clear)
         sources, rest = _split_peaks(hidden.radiance(evidence), evidence, within=region.radius)
-        sun = replace(sun, ratio=None if sun_through else sun.ratio, name=sun.name or "sun")
-    if sun is not None and not sun_through and (sun.ratio is None or evidence.is_sun(sun.distance)):
-        sun = sun_towards(sun, sky, problem, evidence, rest)
+        # the sky tells the strength better than the edges of shadows, where Gaussians mix lit and shaded
+        sun = replace(sun, ratio=None, name=sun.name or "sun")
+    if sun is not None and not sun_through:
+        # a decisive sun under a clear sky has that sky's strength
+        is_doubted = known is not None if sun.ratio is None else evidence.is_sun(sun.distance)
+        sun = sun_towards(sun, sky, problem, evidence, rest) if is_doubted else sun
     mean = with_blocker_distances(Light(sources, _ambient_of(rest), **_seen_shares(evidence)), scene, place)
     ground = None if sun is None or sun_through or not evidence.is_outdoors else OpenGround.around(whole, region, sun)
     found = EstimatedLight(mean, None, ground, hidden, clear, evidence, place)

@@ -35,8 +35,8 @@ _ABOVE_MAX = 100.0  # precision of the prior that keeps albedos below the maximu
 _TOUCHING = math.cos(math.radians(15))  # clipped directions nearer than this are one patch
 _LOWEST = math.sin(math.radians(-8))  # lowest sine of a source's height; windows reach below the horizon
 _MAX_PATCHES = 5  # clipped patches that may be sources; the search tries all their combinations
-_AT_HORIZON, _ABOVE_HORIZON = (-0.1, 0.1), (0.1, 0.4)  # sines of heights; set by hand
-_OPEN = 1.2  # ratio of the distances seen there; six of seven rooms have up to 1.19, places outdoors 1.23 or more (log)
+_AT_HORIZON, _ABOVE_HORIZON = (-0.1, 0.2), (0.1, 0.4)  # sines of heights; set by hand
+_OPEN = 1.2  # ratio of the distances seen there; rooms have up to 1.19, gardens and terraces 1.23 or more (log)
 
 
 @dataclass(frozen=True)
