@@ -37,7 +37,7 @@ from splatgraft_paper.benchmark.true_light import read_probe
 from splatgraft_paper.exam.measure import light_errors, measure_row
 from splatgraft_paper.exam.scenes import SIZE, TrueView, draw_scenes
 from splatgraft_paper.synthesis import benchmark
-from splatgraft_paper.synthesis.jobs import Job, Model, RenderSize, Take, render_job
+from splatgraft_paper.synthesis.jobs import Job, Model, Take, render_job
 from splatgraft_paper.synthesis.places import make_scene
 from splatgraft_paper.synthesis.scene import Camera, Place
 
@@ -76,9 +76,7 @@ def reconstructed(folder: Path, work: Path) -> Gaussians:
     return read_gaussians(scene)
 
 
-def true_pictures(
-    folder: Path, cameras: Cameras, size: RenderSize, options: argparse.Namespace
-) -> tuple[Path, list[int]]:
+def true_pictures(folder: Path, cameras: Cameras, options: argparse.Namespace) -> tuple[Path, list[int]]:
     """Render held-out views without and with each mesh; returns the takes' folder and the views' numbers."""
     record = json.loads((folder / "scene.json").read_text())
     scene = make_scene(record["kind"], record["seed"])
@@ -93,6 +91,8 @@ def true_pictures(
         for index in set(range(len(cameras))) - set(chosen):
             (rendered / take.name / f"{index:04d}.done").touch()
     models = {kind: Model(str((meshes / f"{kind}.glb").resolve()), height_at(place), place.location) for kind in KINDS}
+    width, height = cameras.sizes[0].tolist()
+    size = replace(SIZE.render, width=width, height=height)
     render_job(Job(scene, models, _blender_cameras(cameras), tuple(takes), size), rendered, options.blender_python)
     return rendered, chosen
 
@@ -111,13 +111,11 @@ def measured(folder: Path, work: Path, options: argparse.Namespace) -> dict:
     target, captured = reconstructed(folder, work), read_cameras(folder / "target")
     fitted = captured[~held_out(len(captured), HELD_OUT_EVERY)]
     cameras, meshes = captured.resized(options.scale), options.out / "meshes"
-    width, height = cameras.sizes[0].tolist()
     light = read_probe(folder / "probe.npy", folder / "suns.json")
     record = json.loads((folder / "scene.json").read_text())
     place = make_scene(record["kind"], record["seed"]).places[0]
     at, found, notes = torch.tensor(place.location), {}, []
-    size = replace(SIZE.render, width=width, height=height)
-    rendered, chosen = true_pictures(folder, cameras, size, options)
+    rendered, chosen = true_pictures(folder, cameras, options)
     for kind in KINDS:
         views = []
         for index in chosen:

@@ -32,7 +32,8 @@ _RELEVELED = 0.7  # share of the mean residual that albedos absorb before a stat
 _MIN_SHARE = 0.1  # minimum unknown share of a direction that may contain a lamp
 _STRENGTHS = (4.0, 12.0, 40.0, 120.0)  # radiance of a lamp over the previous radiance
 _APART = math.radians(18)  # minimum angle between two directions that are tried as lamps
-_SPREAD = math.radians(35)  # maximum angle over which the direction of a lamp is uncertain
+_SPREAD = math.radians(35)
+"""Maximum angle over which a lamp's direction is uncertain, and standard deviation of `RadianceEstimate.spread`."""
 _ROUNDS = 8  # iterations of reweighting
 
 
@@ -79,7 +80,7 @@ class RadianceEstimate:
         )
 
     def spread(self, seen: Float[Tensor, "k"]) -> "RadianceEstimate":
-        """Average the radiance of each direction's unseen part over the directions around it.
+        """Average the radiance of each direction's unseen part over the unseen parts around it, by a Gaussian.
 
         Args:
             seen: Seen share of each of the `DIRECTIONS`.
