@@ -202,6 +202,10 @@ def evenly_colored(maps: DepthMaps, front: Tensor, back: Tensor) -> Occlusion:
     return occlusion_from_maps(replace(maps, color=color), front, back)
 
 
+def no_change(scene: Gaussians, change: Tensor, center: Tensor, *, nearest: float) -> Tensor:
+    return torch.zeros(9, 3)
+
+
 def matt(gaussians: Gaussians, normals: Tensor, views: object, light: ReflectedLight):
     return estimate_materials(gaussians, normals, (), light)
 
@@ -409,6 +413,11 @@ ROWS: Mapping[str, Row] = {
     ),
     "self-third": Row(
         "object", "a third of the ambient light passes it", {"relighting.shadows.scene_ratio._SELF_AMBIENT": 0.0}
+    ),
+    "shadowed-surroundings": Row(
+        "layers",
+        "shadows and bounce in the ambient light of the object",
+        {"relighting.layers.radiance_change": no_change},
     ),
     "soft-cosine": Row(
         "place",

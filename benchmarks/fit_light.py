@@ -9,6 +9,7 @@ same RMS for the ratio of both places.
 1. Estimate the evidence at both places of each scene, and keep it in files (`--evidence`) for later runs.
 2. Change one to three parameters by random factors; keep the change if the objective falls.
 3. With `--folds N`, repeat this N times without one part of the scenes, and print the objective of that part.
+4. Print the error of the level, which is `shading.LEVEL_ERROR_STOPS`, and whether a regression would reduce it.
 """
 
 import json
@@ -102,6 +103,30 @@ def scene_errors(pair: Pair, numbers: dict[str, float]) -> list[float]:
     return [float(e.pow(2).mean().sqrt()) for e in (*away, away[0] - away[1])]
 
 
+def levels(pair: Pair, numbers: dict[str, float]) -> list[list[float]]:
+    """Compute estimated and true level at both places: mean of log2(irradiance / pi) over `NORMALS`, stops."""
+    found = [(log_irradiance(place, numbers), place.truth.log2()) for place in pair]
+    return [[float(values.mean()) - math.log2(math.pi) for values in both] for both in found]
+
+
+def level_line(values: Float[Tensor, "s 2 2"]) -> str:
+    """Describe the error of the level, and that of scenes left out from a regression of true on estimated levels."""
+    estimated, true = values.unbind(2)
+
+    def line(kept: Tensor) -> Tensor:
+        columns = torch.stack([estimated[kept].flatten(), torch.ones(2 * len(kept))], 1)
+        return torch.linalg.lstsq(columns, true[kept].flatten()[:, None]).solution[:, 0]
+
+    everything = torch.arange(len(values))
+    share = float(line(everything)[0])
+    left_out = []
+    for i in range(len(values)):
+        slope, shift = line(everything[everything != i])
+        left_out.append(slope * estimated[i] + shift - true[i])
+    before, after = (float(e.pow(2).mean().sqrt()) for e in (estimated - true, torch.stack(left_out)))
+    return f"level: error {before:.2f} stops, {after:.2f} by a regression on the other scenes (share {share:.2f})"
+
+
 class Scenes:
     """Scenes whose errors several processes compute; these inherit the evidence."""
 
@@ -110,6 +135,10 @@ class Scenes:
         self.names = list(pairs)
         self._pairs = list(pairs.values())
         self._pool = multiprocessing.get_context("fork").Pool(jobs, _start, (self._pairs,))
+
+    def levels(self, numbers: dict[str, float]) -> Float[Tensor, "s 2 2"]:
+        """Compute `levels` of all scenes."""
+        return torch.tensor(self._pool.starmap(_levels_of, [(i, numbers) for i in range(len(self.names))], chunksize=1))
 
     def errors(self, numbers: dict[str, float], which: Sequence[int] | None = None) -> Float[Tensor, "s 3"]:
         """Compute `scene_errors` of some scenes, or of all."""
@@ -127,6 +156,10 @@ def _start(pairs: list[Pair]) -> None:
 
 def _errors_of(index: int, numbers: dict[str, float]) -> list[float]:
     return scene_errors(_INHERITED[index], numbers)
+
+
+def _levels_of(index: int, numbers: dict[str, float]) -> list[list[float]]:
+    return levels(_INHERITED[index], numbers)
 
 
 def objective(found: Float[Tensor, "s 3"]) -> float:
@@ -202,6 +235,7 @@ def main() -> None:
     for name, row in zip(scenes.names, rows, strict=True):
         print(f"{name:20s} new {row[0]:.2f} old {row[1]:.2f} ratio {row[2]:.2f}")
     print(f"objective {objective(rows):.3f}, means {[round(v, 3) for v in rows.mean(0).tolist()]}")
+    print(level_line(scenes.levels(found)))
     print(json.dumps(found))
     if options.out is not None:
         options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

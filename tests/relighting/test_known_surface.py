@@ -1,6 +1,7 @@
 """Meshes in captured light: known albedo, normals, gloss and emission, in closed form."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -121,6 +122,29 @@ def test_white_metal_under_lamps_all_around_is_white(roughness):
     found = lamps.microfacet_radiance(views, torch.tensor([[0.0, 0.0, 1.0]]), white)
     # without further reflections .99, .82 and .42; their fit is within a sixth
     assert found == pytest.approx(1.0, abs=0.17)
+
+
+def test_the_relief_of_a_normal_map_shades_itself_and_takes_no_light_from_below():
+    thing, sun, tilt = ball(0.4), torch.tensor(SUN), math.radians(45)
+    aside = torch.nn.functional.normalize(torch.linalg.cross(thing.normals, torch.tensor([[0.3, -0.8, 0.5]])), dim=1)
+    bent = replace(thing, normals=math.cos(tilt) * thing.normals + math.sin(tilt) * aside)
+    found = lit(bent, sky(0.0, LightSource(SUN, (3.0, 3.0, 3.0), angular_radius_deg=0.3))).received[0][:, 0]
+    plane, relief = thing.normals @ sun, bent.normals @ sun
+    # Smith's masking of GGX with alpha^2 = tan^2 / 8, as in Estevez et al.
+    masked = 2 / (1 + (1 + 0.125 * (1 / plane**2 - 1)).sqrt())
+    in_front = (plane > 0.15) & (relief > 0.3)
+    assert float((found / (3 * relief * masked))[in_front].sub(1).abs().quantile(0.9)) < 0.02
+    below = (plane < 0) & (relief > 0.2)
+    assert int(below.sum()) > 20
+    assert float(found[below].max()) < 0.05
+
+
+def test_an_object_reflects_its_shadow_on_the_surface_below_it():
+    sun = LightSource((0.0, 0.0, 1.0), (3.0, 3.0, 3.0), angular_radius_deg=0.3)
+    low, high = (lit(ball(0.4), sky(0.3, sun), height=height) for height in (0.45, 12.0))
+    downward, upward = (ball(0.4).normals[:, 2] * side > 0.5 for side in (-1, 1))
+    assert float(low.received[0][downward].mean()) < 0.9 * float(high.received[0][downward].mean())
+    assert torch.allclose(low.received[0][upward], high.received[0][upward], rtol=0.05)
 
 
 def test_emission_adds_to_reflected_light():

@@ -33,6 +33,7 @@ from splatgraft.relighting.light.panorama import (
     cube_cameras,
     cube_directions,
     nearest_directions,
+    radiance_change,
     render_panorama,
     shares_of,
     surroundings_at,
@@ -96,6 +97,20 @@ def test_light_is_seen_in_its_direction_in_linear_light():
     above = seen.radiance[seen.directions[..., 2] > 0.3]
     # away from the border only equal colours are blended; alpha near 1 leaves 8 bits of float noise
     assert (above - linear_from_srgb(torch.tensor([0.9, 0.6, 0.3]))).abs().max() < 2e-3
+
+
+def test_the_change_of_the_light_around_is_the_difference_of_two_panoramas():
+    directions = even_directions(3000)
+    gray, nothing = torch.full((3000, 3), 0.7), torch.zeros(3)
+    change = torch.where(directions[:, 2:] < -0.2, torch.tensor([-0.6, -0.3, 0.2]), nothing)
+    scene = shell(gray, directions)
+    changed = shell(srgb_from_linear(linear_from_srgb(gray) * (1 + change)), directions)
+    before, after = (render_panorama(one, nothing, size=32) for one in (scene, changed))
+    difference = (after.radiance - before.radiance).reshape(-1, 3)
+    expected = fit_sh(before.directions.reshape(-1, 3), difference, before.solid_angles.flatten())
+    found = radiance_change(scene, change, nothing, nearest=0.0)
+    # alpha is below 1, and colours are blended before and after the conversion to linear light
+    assert (found - expected).abs().max() < 0.03 * expected.abs().max()
 
 
 def test_coverage_is_the_captured_share():

@@ -24,7 +24,7 @@ from splatgraft.relighting.materials import ReflectedLight, estimate_materials, 
 from splatgraft.relighting.nearest_neighbours import nearest_neighbours
 from splatgraft.relighting.normals import estimate_normals
 from splatgraft.relighting.object_views import fuse_normals, object_views
-from splatgraft.relighting.shading import KNOWN_IN_ESTIMATED, KNOWN_SURFACES, apply_gain, shade_ratio
+from splatgraft.relighting.shading import KNOWN_SURFACES, apply_gain, shade_ratio
 from splatgraft.rendering import render
 
 ORIGIN = BoundingSphere(torch.zeros(3), 0.5)
@@ -260,16 +260,10 @@ def random_gaussians():
     return replace(scene, sh=scene.sh / 8)  # deviations of 0.05
 
 
-@pytest.mark.parametrize(
-    # two stops above the typical .6 remain .82 stops
-    ("settings", "level"),
-    [(KNOWN_SURFACES, 2.4), (KNOWN_IN_ESTIMATED, 0.6 * 4**0.41)],
-)
-def test_an_estimated_level_is_drawn_to_that_of_all_captures_and_a_given_one_is_not(settings, level):
-    variation = torch.tensor([0.5, 1.0, 2.0])[:, None]
-    target, source, opacities = (2.4 * variation).expand(3, 3), torch.ones(3, 3), torch.ones(3)
-    shade = shade_ratio(target, source, opacities, settings=settings)
-    assert torch.allclose(shade, (level * variation).expand(3, 3), rtol=1e-4)
+def test_a_known_surface_takes_the_whole_level_of_the_light():
+    received = (2.4 * torch.tensor([0.5, 1.0, 2.0])[:, None]).expand(3, 3)
+    shade = shade_ratio(received, torch.ones(3, 3), torch.ones(3), settings=KNOWN_SURFACES)
+    assert torch.allclose(shade, received, rtol=1e-4)
 
 
 def test_a_gain_of_1_changes_no_bit():

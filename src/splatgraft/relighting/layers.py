@@ -16,11 +16,12 @@ from splatgraft.relighting.cast_shadows import Shadows
 from splatgraft.relighting.light.description import describe_light
 from splatgraft.relighting.light.estimate import EstimatedLight
 from splatgraft.relighting.light.light import Light, light_confidence
+from splatgraft.relighting.light.panorama import NEAREST, radiance_change
+from splatgraft.relighting.light.samples import sample_light
 from splatgraft.relighting.materials import gloss_bands, reflected_light
 from splatgraft.relighting.prepared_object import PreparedObject
 from splatgraft.relighting.scene_light import SceneLight
 from splatgraft.relighting.shading import (
-    KNOWN_IN_ESTIMATED,
     KNOWN_LIGHTS,
     KNOWN_SURFACES,
     LEVEL_ERROR_STOPS,
@@ -193,13 +194,18 @@ def assemble_layers(merged: Gaussians, scene: SceneLight, objects: Sequence[Prep
         objects: All objects that have Gaussians.
         shadows: Shadows under that light.
     """
-    shadings = [_shading(one, scene, shares) for one, shares in zip(objects, shadows.scene_visibility, strict=True)]
     receivers, on_scene = shadows.receivers, shadows.on_scene
     rest = torch.ones(scene.captured.gaussians.count, dtype=torch.bool)
     rest[receivers.origin] = False
     rest_index = rest.nonzero()[:, 0]
     object_rows = torch.arange(scene.captured.gaussians.count, merged.count)
-    gaussians = concatenate([merged.select(rest_index), receivers.gaussians, merged.select(object_rows)])
+    around = concatenate([merged.select(rest_index), receivers.gaussians])
+    change = torch.cat([torch.zeros(len(rest_index), 3), on_scene.shadow + on_scene.bounce - 1])
+    shadings = [
+        _shading(one, _with_shadowed_surroundings(scene, around, change, one), shares)
+        for one, shares in zip(objects, shadows.scene_visibility, strict=True)
+    ]
+    gaussians = concatenate([around, merged.select(object_rows)])
     count = gaussians.count - len(object_rows)
     ones, zeros = torch.ones(len(rest_index), 3), torch.zeros(len(rest_index), 3)
     replaced = [torch.full((one.gaussians.count,), one.source_lighting is not None) for one in objects]
@@ -270,6 +276,23 @@ def _shadow_notes(shadow: Float[Tensor, "n 3"]) -> tuple[Note, ...]:
     return (Note(text, "warning", "Set the object down on its support, or set the sun by hand (--sun-through)."),)
 
 
+def _with_shadowed_surroundings(
+    scene: SceneLight, around: Gaussians, change: Float[Tensor, "m 3"], one: PreparedObject
+) -> SceneLight:
+    """Change the ambient light of an object by the shadow and the bounce that it sees on its surroundings.
+
+    Args:
+        scene: The light at the objects' place without them.
+        around: The m Gaussians of the scene.
+        change: Relative change of their linear rgb by all objects.
+        one: The object.
+    """
+    sphere = one.sphere
+    seen = radiance_change(around, change, sphere.center, nearest=NEAREST * sphere.radius)
+    light = replace(scene.light, ambient=scene.light.ambient + seen)
+    return replace(scene, light=light, samples=sample_light(light))
+
+
 def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Tensor, "n k"]) -> _Shading:
     """Shade an object by the scene's light, ambient light included."""
     normals, opacities = one.normals.vectors, one.gaussians.opacities
@@ -281,8 +304,7 @@ def _shading(one: PreparedObject, scene: SceneLight, scene_visibility: Float[Ten
     if source is None:
         return _Shading(received, unknown_origin_ratio(received, opacities), None)
     if isinstance(one.gaussians, KnownSurface):
-        is_level_known = scene.estimate is None or scene.estimate.sky is not None
-        settings = KNOWN_SURFACES if is_level_known else KNOWN_IN_ESTIMATED
+        settings = KNOWN_SURFACES
     else:
         settings = KNOWN_LIGHTS if scene.estimate is None and source.estimate is None else ShadeSettings()
     shade = shade_ratio(received, source.irradiance, opacities, settings=settings)

@@ -34,22 +34,14 @@ class ShadeSettings:
 
     It is small because an object turns violet or blue if the old light's tint is estimated wrongly. Chosen on 19 scenes
     that the light was not fitted to: 0 and 0.25 are equally good, 1 is worse."""
-    typical: float = 1.0
-    """Ratio from which `level_share` counts."""
 
 
 KNOWN_LIGHTS = ShadeSettings(level_share=1.0, tint_share=1.0)
 """Settings for two given lights, which are certain."""
 KNOWN_SURFACES = ShadeSettings(floor=0.0, level_share=1.0, tint_share=1.0)
-"""Settings for surfaces of known albedo under a light of known level, with no old light whose errors a floor would
-damp."""
-KNOWN_IN_ESTIMATED = replace(KNOWN_SURFACES, level_share=0.41, typical=0.6)
-"""Settings for surfaces of known albedo under a light whose level is estimated from surfaces.
-
-The share and the typical ratio are the regression of true on estimated levels over 40 places (benchmarks/LOG.md).
-Captures are exposed alike, so the mean of these levels counts more than the estimate."""
-LEVEL_ERROR_STOPS = 0.65
-"""Standard error of a level that is drawn so, of places left out of that regression."""
+"""Settings for surfaces of known albedo, with no old light whose errors shares and a floor would damp."""
+LEVEL_ERROR_STOPS = 0.5
+"""Standard error of an estimated level, over the 68 places of 34 scenes (benchmarks/fit_light.py)."""
 SKY_LEVEL_ERROR_STOPS = 0.3
 """Standard error of a level by a clear sky; set by hand. Nine scenes of four exams have .13 (benchmarks/LOG.md)."""
 
@@ -112,9 +104,8 @@ def light_scale(
     """
     log_ratio = (_floored(target, opacities, settings) / _floored(source, opacities, settings)).log()
     mean = _mean(log_ratio, opacities)[0]
-    gray = mean.mean()
-    level, tint = gray - math.log(settings.typical), mean - gray
-    return ((settings.level_share - 1) * level + (settings.tint_share - 1) * tint).exp()
+    level = mean.mean()
+    return ((settings.level_share - 1) * level + (settings.tint_share - 1) * (mean - level)).exp()
 
 
 def unknown_origin_ratio(target: Float[Tensor, "n 3"], opacities: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:

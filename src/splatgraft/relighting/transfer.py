@@ -6,7 +6,7 @@ estimated, and colours are multiplied by ratios of irradiance. Each step is one 
 1. `find_scene_light`: the light of the target at the objects' place.
 2. `capture_object` and `prepare_object`: each object's normals, materials and old light, in its own frame, then placed.
 3. `cast_shadows`: the shadows and the bounce of the objects.
-4. `assemble_layers`: the composite with its change of light in layers.
+4. `assemble_layers`: the objects' shading, by the light with those shadows, and all changes of light in layers.
 
 `TransferValues` keeps these values, so that the next transfer after a move computes only the changed ones.
 """

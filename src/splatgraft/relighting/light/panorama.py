@@ -2,6 +2,7 @@
 
 - `render_panorama` renders the cube map at a point.
 - `panorama_at` first tests whether there is light at a place.
+- `radiance_change` renders the change of the light at a point by shadows on the scene.
 - `surroundings_at` sorts the cube map into `DIRECTIONS`: captured radiance, clipped and unseen shares.
 """
 
@@ -15,9 +16,10 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras, pinhole
-from splatgraft.core.directions import even_directions
+from splatgraft.core.directions import even_directions, fit_sh
 from splatgraft.core.gaussians import Gaussians
 from splatgraft.core.images import linear_from_srgb
+from splatgraft.core.spherical_harmonics import rgb_from_dc
 from splatgraft.rendering import RenderOptions, render
 
 DIRECTIONS = even_directions(320)
@@ -27,6 +29,7 @@ SOLID_ANGLE = 4 * math.pi / len(DIRECTIONS)
 FARTHEST = 1e4
 """Upper bound of distances, world units."""
 _TABLE = 64  # pixels; face width of the cube map of nearest directions
+_CHANGE_SIZE = 24  # the same of a change, of which harmonics of degree 2 are left
 
 # each face's right, down and forward axes as rows: +x, -x, +y, -y, +z, -z
 _FACES = torch.tensor(
@@ -146,13 +149,10 @@ def render_panorama(
         nearest: Minimum distance of a Gaussian's centre, world units; nearer ones are left out.
         with_distance: Whether to return the distances of the surfaces, too.
     """
-    away = (scene.means - center.to(scene.means)).norm(dim=-1)
-    # in front of all Gaussians that are left, even in the corners of a face
-    near = max(nearest / math.sqrt(3), 1e-6)
     rendered = render(
-        scene.select((away >= nearest) & (scene.scales.max(1).values < _WIDEST * away)),
+        scene.select(_shown_from(scene, center, nearest)),
         cube_cameras(center, size),
-        options=RenderOptions(near=near),
+        options=_beyond(nearest),
         outputs=frozenset({"color", "depth"} if with_distance else {"color"}),
     )
     alpha = rendered.alpha.detach().clamp(0, 1)
@@ -172,6 +172,40 @@ def render_panorama(
         solid_angles=solid_angles.to(alpha),
         distance=distance,
     )
+
+
+def radiance_change(
+    scene: Gaussians, change: Float[Tensor, "n 3"], center: Float[Tensor, "3"], *, nearest: float
+) -> Float[Tensor, "9 3"]:
+    """Compute the change of the radiance around a point by a change of the scene's colours.
+
+    Args:
+        scene: All Gaussians.
+        change: Relative change of their linear rgb.
+        center: World units.
+        nearest: Minimum distance of a Gaussian's centre, world units; nearer ones are left out.
+
+    Returns:
+        Coefficients of spherical harmonics of degree 2, linear rgb.
+    """
+    is_shown = _shown_from(scene, center, nearest)
+    shown = scene.select(is_shown)
+    linear = linear_from_srgb(rgb_from_dc(shown.sh[:, 0]).clamp(0, 1)) * change[is_shown]
+    cameras = cube_cameras(center, _CHANGE_SIZE)
+    rendered = render(shown, cameras, options=_beyond(nearest), outputs=frozenset(), features=linear)
+    directions, solid_angles = cube_directions(_CHANGE_SIZE)
+    return fit_sh(directions.reshape(-1, 3), rendered.features.reshape(-1, 3), solid_angles.flatten())
+
+
+def _shown_from(scene: Gaussians, center: Float[Tensor, "3"], nearest: float) -> Bool[Tensor, "n"]:
+    """Select the Gaussians that a panorama at `center` shows."""
+    away = (scene.means - center.to(scene.means)).norm(dim=-1)
+    return (away >= nearest) & (scene.scales.max(1).values < _WIDEST * away)
+
+
+def _beyond(nearest: float) -> RenderOptions:
+    """Return options that draw all Gaussians farther than `nearest`, even in the corners of a cube map's face."""
+    return RenderOptions(near=max(nearest / math.sqrt(3), 1e-6))
 
 
 def panorama_at(scene: Gaussians, place: BoundingSphere) -> Panorama | NoLight:

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.directions import frames_along
-from splatgraft.core.gaussians import Gaussians
+from splatgraft.core.gaussians import Gaussians, KnownSurface
+from splatgraft.core.rotations import rotation_from_quaternion
 from splatgraft.relighting.light.samples import LightSamples
 from splatgraft.relighting.normals import raised
 from splatgraft.relighting.shadows.occlusion import Occlusion, occluded_irradiance, occlusion_from_maps
@@ -104,7 +105,21 @@ def self_visibility(
     maps = splat_depth_maps(occluders_of(gaussians), window, size=_AMBIENT_SIZE)
     visible = visibility(maps, raised(gaussians, normals), normals, bias=_SELF_BIAS * maps.texel)
     through = _SELF_AMBIENT + (1 - _SELF_AMBIENT) * visible
-    return torch.where(torch.tensor(samples.is_source), visible, through)
+    found = torch.where(torch.tensor(samples.is_source), visible, through)
+    return found * _past_relief(gaussians, normals, samples) if isinstance(gaussians, KnownSurface) else found
+
+
+def _past_relief(surface: KnownSurface, normals: Float[Tensor, "m 3"], samples: LightSamples) -> Float[Tensor, "m k"]:
+    """Compute the share of each sample that passes the relief of a normal map; 1 where the normal is that of the plane.
+
+    The relief is a GGX surface with alpha^2 = tan^2(tilt of the normal) / 8, which blocks light along the plane and all
+    light from below (Estevez et al. 2019).
+    """
+    axis = rotation_from_quaternion(surface.quaternions)[:, :, 2]
+    tilt = (axis * normals).sum(1)  # its cosine, negative for an axis that points inwards
+    rough = (1 / tilt.abs().clamp(0.1, 1) ** 2 - 1) / 8
+    cosine = (tilt.sign()[:, None] * axis @ samples.directions.T).clamp(1e-4, 1)
+    return 2 / (1 + (1 + rough[:, None] * (1 / cosine**2 - 1)).sqrt())
 
 
 @dataclass(frozen=True)
