@@ -56,3 +56,33 @@ def test_a_sun_in_the_panorama_becomes_a_source_however_bright_the_sky_is(sky, s
 def test_a_panorama_without_peaks_has_none():
     light = light_from_probe(day(sky=0.3, sun=0.3, radius_deg=2.0), [])
     assert light.sources == ()
+
+
+def room(*windows):
+    """Return even light with round windows of radiance 2: (direction, radius in degrees)."""
+    directions, _ = pixels()
+    gray = torch.full((H, W), 0.15)
+    for towards, radius_deg in windows:
+        middle = torch.nn.functional.normalize(torch.tensor(towards), dim=0)
+        gray = torch.where(directions @ middle > math.cos(math.radians(radius_deg)), 2.0, gray)
+    return gray[..., None].repeat(1, 1, 3)
+
+
+AROUND = tuple(((math.cos(a), math.sin(a), 0.3), 12.0) for a in (0.1, 1.1, 2.1, 3.1, 4.1, 5.1))
+
+
+@pytest.mark.parametrize(
+    "windows",
+    [
+        # one of .74 steradians, and more windows than there are sources
+        (((0.2, 1.0, 0.3), 28.0),),
+        AROUND,
+    ],
+)
+def test_windows_light_as_the_panorama_does_however_wide_or_many_they_are(windows):
+    panorama = room(*windows)
+    light = light_from_probe(panorama, [])
+    normals = even_directions(100)
+    away = (light.irradiance(normals) / lit_by(panorama, normals)).mean(1).log2()
+    assert light.sources
+    assert float(away.square().mean().sqrt()) < 0.12

@@ -1,7 +1,7 @@
 """Gaussians on the surface of a triangle mesh, one flat disc for each of many evenly spread points.
 
 1. Find the sides of the surface that can be seen: the outside of closed parts, both sides of open ones.
-2. Draw points evenly by area, and keep those of a maximal Poisson-disc pattern (greedy in random order).
+2. Draw points evenly by area. Keep rows along the edges and a Poisson-disc pattern inside, greedy in random order.
 3. Look up normals and material at each point; textures are averaged over the point's share of the surface.
 """
 
@@ -22,14 +22,14 @@ from splatgraft.core.spherical_harmonics import dc_from_rgb
 
 DEFAULT_BUDGET = 60_000
 """Number of Gaussians of a mesh; 1.5 radii away, one of a ball is then 2 pixels wide in a picture of 640."""
-_CANDIDATES = 5  # drawn points per kept one
-_DENSITY = 0.5  # kept points in a square as wide as their smallest distance, for that many candidates
-_WIDTH = 0.65  # standard deviation of a disc over the spacing of the points
+_CANDIDATES = 8  # drawn points per kept one
+_DENSITY = 0.55  # kept points in a square as wide as their smallest distance, for that many candidates
+_WIDTH = 0.7  # standard deviation of a disc over the spacing of the points
 _THICKNESS = 0.02  # standard deviation across a disc over the spacing
 _OPACITY = 0.99
-_INSET = 0.65  # distance of the discs from silhouettes and edges, which they would else overlap, spacings
+_INSET = 0.65  # distance of a closed part's discs below the surface, spacings; on it they would overlap silhouettes
 _APART = 0.5  # distance of an open part's two sides from the surface, spacings; nearer ones show through each other
-_RIM = 0.3  # largest share of a triangle's height over an edge that this empties
+_ROW = 1.2  # distance of a row of discs from an edge, spacings; nearer ones would overlap it
 _SHARP = math.cos(math.radians(30))  # cosine of half the angle between the normals of a ridge's sides
 _SAME_SIDE = 0.3  # smallest cosine between the normals of two points that exclude each other
 _DEGENERATE = 1e-9  # smallest area of a triangle over the square of the mesh's size
@@ -59,15 +59,13 @@ def sample_mesh(mesh: Mesh, *, budget: int = DEFAULT_BUDGET, seed: int = 0) -> K
     rng = np.random.default_rng(seed)
     total = float(area[triangle].sum())
     which, weights = _drawn(area[triangle], _CANDIDATES * budget, rng)
-    corners = mesh.corners[triangle[which]]
-    opposite = np.roll(weights, 1, axis=1)  # the weight of the corner opposite to each edge
-    heights = 2 * area[triangle[which], None] / np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    near = (opposite * heights < _INSET * math.sqrt(total / budget)) & (opposite < _RIM)
-    inside = (~(is_edge[which] & near).any(1)).nonzero()[0]
-    facing = unit(across)[triangle[which]] * sign[which, None]
-    points = np.einsum("nc,nci->ni", weights, corners)
+    facing = unit(across)[triangle] * sign[:, None]
+    points, sides = np.einsum("nc,nci->ni", weights, mesh.corners[triangle[which]]), facing[which]
     radius = math.sqrt(_DENSITY * total / budget)
-    kept = inside[_spread(points[inside], facing[inside], radius=radius)[:budget]]
+    is_edge &= area[triangle, None] > 0
+    order = _inside(points, sides, _edges(mesh.corners[triangle], facing, is_edge, radius), math.sqrt(total / budget))
+    which, weights, points, facing = which[order], weights[order], points[order], sides[order]
+    kept = _spread(points, facing, radius=radius)[:budget]
     which, weights, points, facing = which[kept], weights[kept], points[kept], facing[kept]
     spacing = math.sqrt(total / len(kept))
     shift = np.where(is_open[which], _APART * spacing, -_insets(points, facing, _INSET * spacing))
@@ -129,6 +127,38 @@ def _drawn(
     u, v = rng.random((2, count))
     root = np.sqrt(u)
     return which, np.stack([1 - root, root * (1 - v), root * v], 1)
+
+
+def _edges(
+    corners: Float[np.ndarray, "s 3 3"], facing: Float[np.ndarray, "s 3"], is_edge: Bool[np.ndarray, "s 3"], step: float
+) -> tuple[Float[np.ndarray, "e 3"], Float[np.ndarray, "e 3"], Float[np.ndarray, "e 3"]]:
+    """Place points along edges, at most `step` apart; returns them, unit vectors into the surface, and its normals."""
+    side, edge = is_edge.nonzero()
+    begin, along = corners[side, edge], corners[side, (edge + 1) % 3] - corners[side, edge]
+    inward = np.cross(facing[side], along)
+    inward *= np.sign((inward * (corners[side, (edge + 2) % 3] - begin)).sum(1, keepdims=True))
+    counts = np.ceil(np.linalg.norm(along, axis=1) / step).astype(int)
+    row = np.arange(len(side)).repeat(counts)
+    share = (np.arange(len(row)) - (counts.cumsum() - counts)[row] + 0.5) / counts[row]
+    return begin[row] + share[:, None] * along[row], unit(inward)[row], facing[side][row]
+
+
+def _inside(
+    points: Float[np.ndarray, "c 3"],
+    facing: Float[np.ndarray, "c 3"],
+    edges: tuple[Float[np.ndarray, "e 3"], Float[np.ndarray, "e 3"], Float[np.ndarray, "e 3"]],
+    spacing: float,
+) -> Int[np.ndarray, "k"]:
+    """Choose points that are not too near to an edge of their side; those in a row along it come first."""
+    on_edge, inward, edge_facing = edges
+    if not len(on_edge):
+        return np.arange(len(points))
+    distance = _ROW * spacing
+    # the normals as further coordinates keep sides apart
+    here, there = (np.hstack([p, distance * n]) for p, n in ((points, facing), (on_edge, edge_facing)))
+    rows = KDTree(here).query(np.hstack([on_edge + distance * inward, distance * edge_facing]))[1]
+    away = KDTree(there).query(here, distance_upper_bound=distance)[0]
+    return np.append(list(dict.fromkeys(np.atleast_1d(rows).tolist())), (away >= distance).nonzero()[0])
 
 
 def _spread(points: Float[np.ndarray, "c 3"], facing: Float[np.ndarray, "c 3"], *, radius: float) -> np.ndarray:

@@ -3,12 +3,13 @@
 The panorama is not clipped: the sun of an environment map, or a studio's lamp, is 100 to 1000 times the mean.
 
 1. Each peak, with the pixels near it, becomes a source, and the median of its surroundings replaces it.
-2. Bright patches of the rest, as a camera would clip them, become sources, too.
+2. The brightest patches of the rest, as a camera would clip them, become sources, too.
 3. The remainder is fitted by ambient light of degree 2.
 """
 
 import json
 import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-from splatgraft.core.directions import fit_sh
+from splatgraft.core.directions import even_directions, fit_sh
 from splatgraft.core.images import srgb_from_linear
 from splatgraft.relighting.light.light import Light, LightSource, angular_radius_deg, light_from_json, light_to_json
 from splatgraft.relighting.light.panorama import Panorama, cube_directions
@@ -28,11 +29,12 @@ TRUE_LIGHT_FILE = "true_light.json"
 _CLIPPED = 0.97  # sRGB; minimum of the brightest channel of a patch
 _BRIGHTEST_MEAN = 0.85  # sRGB; minimum mean of the three channels, since saturated colours are no light
 _SMALLEST = 2e-4  # steradians; a smaller patch is a highlight
-_LARGEST = 0.6  # steradians; a larger patch is sky and stays ambient
+_LARGEST = (0.6, 1.5)  # steradians; what is larger is sky. The value that gives the better irradiance is taken
 _MAX_PATCHES = 4
 _MAX_JOINED = 32  # number of the largest patches, which may be joined; others are dropped
 _WIDEST = math.radians(15)  # radians, half the extent; longer patches are cut in half
 
+_NORMALS = even_directions(100)
 _FACE = 64  # pixels; width of a face of the cube map
 # factors on the mean gray radiance, set by hand: windows of rooms stay below the first
 _PEAK_OVER_MEAN, _PEAK_AROUND = 50.0, 5.0  # minimum of a peak's brightest pixel, and of the other pixels of the peak
@@ -54,9 +56,6 @@ def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Ligh
         directions=directions,
         solid_angles=solid_angles,
     )
-    patches, of_patches = _bright_patches(cube)
-    weights = (cube.solid_angles * ~of_patches).flatten()
-    ambient = fit_sh(directions.reshape(-1, 3), cube.radiance.reshape(-1, 3), weights)
     sources = [
         LightSource(
             direction=_triple(sun["direction"]),
@@ -66,8 +65,24 @@ def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Ligh
         )
         for sun in suns
     ]
-    ordered = sorted([*sources, *peaks, *patches], key=lambda source: -source.luminance)
-    return Light(sources=tuple(ordered), ambient=ambient)
+    found = min((_patches_and_rest(cube, largest) for largest in _LARGEST), key=lambda light: _error(light, cube))
+    ordered = sorted([*sources, *peaks, *found.sources], key=lambda source: -source.luminance)
+    return replace(found, sources=tuple(ordered))
+
+
+def _patches_and_rest(panorama: Panorama, largest: float) -> Light:
+    """Represent a panorama by sources for its bright patches, and ambient light."""
+    patches, of_patches = _bright_patches(panorama, largest)
+    weights = (panorama.solid_angles * ~of_patches).flatten()
+    ambient = fit_sh(panorama.directions.reshape(-1, 3), panorama.radiance.reshape(-1, 3), weights)
+    return Light(sources=tuple(patches), ambient=ambient)
+
+
+def _error(light: Light, panorama: Panorama) -> float:
+    """Compute the mean squared error of a light's irradiance in logarithms."""
+    cosine = (_NORMALS @ panorama.directions.reshape(-1, 3).T).clamp_min(0)
+    true = (cosine * panorama.solid_angles.flatten()) @ panorama.radiance.reshape(-1, 3)
+    return float((light.irradiance(_NORMALS) / true.clamp_min(1e-6)).log().square().mean())
 
 
 def _without_peaks(panorama: Float[Tensor, "h w 3"]) -> tuple[Float[Tensor, "h w 3"], list[LightSource]]:
@@ -127,7 +142,14 @@ def sample_panorama(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, 
     return values[0, :, 0].T.reshape(directions.shape).contiguous()
 
 
-def _bright_patches(panorama: Panorama) -> tuple[list[LightSource], Bool[Tensor, "6 s s"]]:
+@dataclass(frozen=True)
+class _Patch:
+    power: float
+    source: LightSource
+    pixels: Bool[Tensor, "6 s s"]
+
+
+def _bright_patches(panorama: Panorama, largest: float) -> tuple[list[LightSource], Bool[Tensor, "6 s s"]]:
     """Find connected patches that a camera would clip, and return them as sources, brightest first, and their pixels.
 
     Patches that an edge between faces separates are joined. Patches wider than 30 degrees are cut in half along their
@@ -141,14 +163,13 @@ def _bright_patches(panorama: Panorama) -> tuple[list[LightSource], Bool[Tensor,
         found, n = ndimage.label(bright[face].numpy(), structure=np.ones((3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
         labels[face] = np.where(found > 0, found + count, 0)
         count += n
-    covered = torch.zeros_like(bright)
-    patches: list[tuple[float, LightSource]] = []
+    patches: list[_Patch] = []
     for group in _joined([torch.from_numpy(labels == i) for i in range(1, count + 1)], panorama):
-        if _SMALLEST <= float(panorama.solid_angles[group].sum()) <= _LARGEST:
-            covered |= group
+        if _SMALLEST <= float(panorama.solid_angles[group].sum()) <= largest:
             patches += _cut(panorama, group)
-    patches.sort(key=lambda patch: -patch[0])
-    return [source for _, source in patches[:_MAX_PATCHES]], covered
+    patches = sorted(patches, key=lambda patch: -patch.power)[:_MAX_PATCHES]
+    covered = sum((patch.pixels for patch in patches), torch.zeros_like(bright))
+    return [patch.source for patch in patches], covered
 
 
 def _joined(groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama) -> list[Bool[Tensor, "6 s s"]]:
@@ -167,7 +188,7 @@ def _joined(groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama) -> list[Boo
     return out
 
 
-def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], *, depth: int = 0) -> list[tuple[float, LightSource]]:
+def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], *, depth: int = 0) -> list[_Patch]:
     """Replace a group by one source of its power, or by several if it is long."""
     directions, angles = panorama.directions[group], panorama.solid_angles[group]
     radiance = panorama.radiance[group]
@@ -193,7 +214,7 @@ def _cut(panorama: Panorama, group: Bool[Tensor, "6 s s"], *, depth: int = 0) ->
         angular_radius_deg=angular_radius_deg(solid_angle),
         name="bright patch",
     )
-    return [(float(mean.sum()) * solid_angle, source)]
+    return [_Patch(float(mean.sum()) * solid_angle, source, group)]
 
 
 def _triple(values: list[float]) -> tuple[float, float, float]:
