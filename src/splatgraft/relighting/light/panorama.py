@@ -188,7 +188,9 @@ def radiance_change(
     Returns:
         Coefficients of spherical harmonics of degree 2, linear rgb.
     """
-    is_shown = _shown_from(scene, center, nearest)
+    away, is_changed = (scene.means - center).norm(dim=1), (change != 0).any(1)
+    # what is farther than all changes hides none of them
+    is_shown = _shown_from(scene, center, nearest) & (away <= (is_changed * away).max())
     shown = scene.select(is_shown)
     linear = linear_from_srgb(rgb_from_dc(shown.sh[:, 0]).clamp(0, 1)) * change[is_shown]
     cameras = cube_cameras(center, _CHANGE_SIZE)
