@@ -555,9 +555,15 @@ def test_a_room_ends_at_its_walls_and_a_garden_does_not(near_height, outdoors):
     assert named.light.sources[0].name == ("sun" if outdoors else "sun or window")
     # out of doors the sun replaces what looked like a near source; in a room a lamp stays
     assert len(named.light.sources) == (1 if outdoors else 2)
-    assert float(named.light.irradiance(UP[None]).mean()) == pytest.approx(
-        float(found.mean.irradiance(UP[None]).mean())
-    )
+
+
+def test_a_sun_keeps_the_brightness_of_the_surface_and_the_light_from_what_was_photographed():
+    found = estimate_of(under_sun())
+    mean, lit = found.mean, found.with_sun(Sun(SUN, 0.3, UP, torch.full((3,), 3.0), 3.0), under_sun().gaussians).light
+    upward, downward = ([float(light.irradiance(normal[None]).mean()) for light in (mean, lit)] for normal in (UP, -UP))
+    assert upward[1] == pytest.approx(upward[0], rel=0.03)  # the ambient part is a fit of degree 2
+    # three quarters of the light on the surface come from the sun, but the photographed floor shines as before
+    assert downward[1] > 0.85 * downward[0]
 
 
 def test_shading_and_highlights_show_how_strong_a_sun_in_a_known_direction_is():

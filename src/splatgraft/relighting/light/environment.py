@@ -16,7 +16,6 @@ from torch import Tensor
 from splatgraft.core.bounds import BoundingSphere
 from splatgraft.core.cameras import Cameras
 from splatgraft.core.gaussians import Gaussians
-from splatgraft.core.images import LUMINANCE
 from splatgraft.core.rotations import rotation_between
 from splatgraft.relighting.captured_scene import CapturedScene
 from splatgraft.relighting.light.estimate import EstimatedLight, estimate_light
@@ -168,24 +167,10 @@ def _radiance(
     # photographed sources are limited to the radiance around them
     is_cut = (rest < around.radiance).any(1, keepdim=True)
     limit = torch.where(is_cut, rest, math.inf)[nearest_directions(flat)]
-    smooth = _interpolated(torch.cat([around.seen[:, None], _hidden(found, rest)], 1), flat)
+    hidden = (rest - around.radiance).clamp_min(0)
+    smooth = _interpolated(torch.cat([around.seen[:, None], hidden], 1), flat)
     radiance = torch.minimum(smooth[:, :1] * shown, limit) + smooth[:, 1:]
     return radiance.reshape(height, width, 3)
-
-
-def _hidden(found: EstimatedLight, rest: Float[Tensor, "k 3"]) -> Float[Tensor, "k 3"]:
-    """Return the part of `rest` that no camera recorded.
-
-    A sun found from shadows dims the ambient light, so that the surface keeps its brightness. Recorded radiance stays,
-    so the hidden part alone is dimmed until the ambient irradiance on the surface agrees, or to 0.
-    """
-    seen = found.evidence.around.radiance
-    hidden = (rest - seen).clamp_min(0)
-    up = found.evidence.up if found.sun is None else found.sun.normal.to(DIRECTIONS)
-    dimming = float(found.light.ambient.norm() / found.mean.ambient.norm().clamp_min(1e-9))
-    cosine = (DIRECTIONS @ up).clamp_min(0)
-    by_all, by_seen, by_hidden = (cosine @ (part @ LUMINANCE) for part in (rest, torch.minimum(rest, seen), hidden))
-    return hidden * ((dimming * by_all - by_seen) / by_hidden.clamp_min(1e-9)).clamp_min(0)
 
 
 def _interpolated(values: Float[Tensor, "k c"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n c"]:

@@ -107,17 +107,33 @@ class EstimatedLight:
         """The sun that shines on the place."""
         return None if self.is_shaded else self.found_sun
 
-    @property
+    @cached_property
     def light(self) -> Light:
         """The estimate, including the sun."""
-        if self.found_sun is None:
-            return self.mean
+        return self.mean if self.found_sun is None else replace(self._lit, ambient=_ambient_of(self.rest()))
+
+    @cached_property
+    def _lit(self) -> Light:
+        """The mean with the sun, and with all of its ambient light dimmed alike."""
+        assert self.found_sun is not None
         changed = without_sun if self.is_shaded else with_sun
         return changed(self.mean, self.found_sun, is_added=self.sky is not None)
 
     def rest(self) -> Float[Tensor, "k 3"]:
-        """Return the linear rgb radiance of all `DIRECTIONS` without the sources, to which ambient light is fitted."""
-        return _split_peaks(self.hidden.radiance(self.evidence), self.evidence, within=math.inf)[1]
+        """Return the linear rgb radiance of all `DIRECTIONS` without the sources, to which ambient light is fitted.
+
+        A sun found from shadows dims the ambient light, so that the surface keeps its brightness. Recorded radiance
+        stays: the part that no camera recorded is dimmed until the ambient irradiance on the surface agrees, or to 0.
+        """
+        rest = _split_peaks(self.hidden.radiance(self.evidence), self.evidence, within=math.inf)[1]
+        if self.found_sun is None:
+            return rest
+        hidden = (rest - self.evidence.around.radiance).clamp_min(0)
+        dimming = float(self._lit.ambient.norm() / self.mean.ambient.norm().clamp_min(1e-9))
+        cosine = (DIRECTIONS @ self.found_sun.normal.to(DIRECTIONS)).clamp_min(0)
+        of_all, of_hidden = (float(cosine @ (part @ LUMINANCE)) for part in (rest, hidden))
+        left = max(dimming * of_all - (of_all - of_hidden), 0.0) / max(of_hidden, 1e-9)
+        return rest - (1 - left) * hidden
 
     def with_sun(self, sun: Sun, scene: Gaussians) -> "EstimatedLight":
         """Replace the sun.
