@@ -147,6 +147,14 @@ def test_an_object_reflects_its_shadow_on_the_surface_below_it():
     assert torch.allclose(low.received[0][upward], high.received[0][upward], rtol=0.05)
 
 
+def test_a_mesh_without_surroundings_has_the_given_light():
+    thing = ball(0.4)
+    placed = PlacedObject(thing, Similarity(1.0, torch.eye(3), torch.zeros(3)))
+    nothing = floor().select(torch.zeros(0, dtype=torch.int64))
+    relit = relight(Composite(nothing, (placed,), torch.zeros(0, dtype=torch.bool)), ring(), light=sky(0.5))
+    assert torch.allclose(relit.received[0], torch.tensor(0.5 * math.pi), rtol=0.1)  # 32 samples
+
+
 def test_emission_adds_to_reflected_light():
     dark = shown(lit(ball(0.3), sky(0.2)), torch.tensor([0.0, 0.0, 1.0]))
     glowing = shown(lit(ball(0.3, emission=0.25), sky(0.2)), torch.tensor([0.0, 0.0, 1.0]))

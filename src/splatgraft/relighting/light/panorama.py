@@ -189,8 +189,10 @@ def radiance_change(
         Coefficients of spherical harmonics of degree 2, linear rgb.
     """
     away, is_changed = (scene.means - center).norm(dim=1), (change != 0).any(1)
+    if not bool(is_changed.any()):
+        return torch.zeros(9, 3)
     # what is farther than all changes hides none of them
-    is_shown = _shown_from(scene, center, nearest) & (away <= (is_changed * away).max())
+    is_shown = _shown_from(scene, center, nearest) & (away <= away[is_changed].max())
     shown = scene.select(is_shown)
     linear = linear_from_srgb(rgb_from_dc(shown.sh[:, 0]).clamp(0, 1)) * change[is_shown]
     cameras = cube_cameras(center, _CHANGE_SIZE)
