@@ -104,9 +104,9 @@ def scene_errors(pair: Pair, numbers: dict[str, float]) -> list[float]:
 
 
 def levels(pair: Pair, numbers: dict[str, float]) -> list[list[float]]:
-    """Compute estimated and true level at both places: mean of log2(irradiance / pi) over `NORMALS`, stops."""
+    """Compute estimated and true level at both places: mean of log2(irradiance) over `NORMALS`, stops."""
     found = [(log_irradiance(place, numbers), place.truth.log2()) for place in pair]
-    return [[float(values.mean()) - math.log2(math.pi) for values in both] for both in found]
+    return [[float(values.mean()) for values in both] for both in found]
 
 
 def level_line(values: Float[Tensor, "s 2 2"]) -> str:

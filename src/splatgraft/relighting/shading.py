@@ -39,7 +39,7 @@ class ShadeSettings:
 KNOWN_LIGHTS = ShadeSettings(level_share=1.0, tint_share=1.0)
 """Settings for two given lights, which are certain."""
 KNOWN_SURFACES = ShadeSettings(floor=0.0, level_share=1.0, tint_share=1.0)
-"""Settings for surfaces of known albedo, with no old light whose errors shares and a floor would damp."""
+"""Settings for surfaces of known albedo; they have no old light, whose errors the shares and the floor damp."""
 LEVEL_ERROR_STOPS = 0.5
 """Standard error of an estimated level, over the 68 places of 34 scenes (benchmarks/fit_light.py)."""
 SKY_LEVEL_ERROR_STOPS = 0.3

@@ -29,7 +29,10 @@ TRUE_LIGHT_FILE = "true_light.json"
 _CLIPPED = 0.97  # sRGB; minimum of the brightest channel of a patch
 _BRIGHTEST_MEAN = 0.85  # sRGB; minimum mean of the three channels, since saturated colours are no light
 _SMALLEST = 2e-4  # steradians; a smaller patch is a highlight
-_LARGEST = (0.6, 1.5)  # steradians; what is larger is sky. The value that gives the better irradiance is taken
+_LARGEST = (
+    0.6,
+    1.5,
+)  # steradians; larger patches are sky and stay ambient. The limit with the better irradiance is used
 _MAX_PATCHES = 4
 _MAX_JOINED = 32  # number of the largest patches, which may be joined; others are dropped
 _WIDEST = math.radians(15)  # radians, half the extent; longer patches are cut in half
@@ -65,17 +68,27 @@ def light_from_probe(panorama: Float[Tensor, "h w 3"], suns: list[dict]) -> Ligh
         )
         for sun in suns
     ]
-    found = min((_patches_and_rest(cube, largest) for largest in _LARGEST), key=lambda light: _error(light, cube))
+    groups = _bright_groups(cube)
+    lights = [_patches_and_rest(cube, groups, largest) for largest in _LARGEST]
+    found = min(lights, key=lambda light: _error(light, cube))
     ordered = sorted([*sources, *peaks, *found.sources], key=lambda source: -source.luminance)
     return replace(found, sources=tuple(ordered))
 
 
-def _patches_and_rest(panorama: Panorama, largest: float) -> Light:
-    """Represent a panorama by sources for its bright patches, and ambient light."""
-    patches, of_patches = _bright_patches(panorama, largest)
-    weights = (panorama.solid_angles * ~of_patches).flatten()
+def _patches_and_rest(panorama: Panorama, groups: list[Bool[Tensor, "6 s s"]], largest: float) -> Light:
+    """Represent the brightest groups of up to `largest` steradians by sources, all other radiance by ambient light.
+
+    Patches wider than 30 degrees are cut in half along their longest extent, twice at most (median cut, Debevec 2005).
+    """
+    patches: list[_Patch] = []
+    for group in groups:
+        if _SMALLEST <= float(panorama.solid_angles[group].sum()) <= largest:
+            patches += _cut(panorama, group)
+    patches = sorted(patches, key=lambda patch: -patch.power)[:_MAX_PATCHES]
+    covered = sum((patch.pixels for patch in patches), torch.zeros_like(panorama.alpha, dtype=torch.bool))
+    weights = (panorama.solid_angles * ~covered).flatten()
     ambient = fit_sh(panorama.directions.reshape(-1, 3), panorama.radiance.reshape(-1, 3), weights)
-    return Light(sources=tuple(patches), ambient=ambient)
+    return Light(sources=tuple(patch.source for patch in patches), ambient=ambient)
 
 
 def _error(light: Light, panorama: Panorama) -> float:
@@ -144,17 +157,15 @@ def sample_panorama(panorama: Float[Tensor, "h w 3"], directions: Float[Tensor, 
 
 @dataclass(frozen=True)
 class _Patch:
+    """A bright patch: its power, by which patches are sorted, its source, and its pixels."""
+
     power: float
     source: LightSource
     pixels: Bool[Tensor, "6 s s"]
 
 
-def _bright_patches(panorama: Panorama, largest: float) -> tuple[list[LightSource], Bool[Tensor, "6 s s"]]:
-    """Find connected patches that a camera would clip, and return them as sources, brightest first, and their pixels.
-
-    Patches that an edge between faces separates are joined. Patches wider than 30 degrees are cut in half along their
-    longest extent, twice at most (median cut, Debevec 2005).
-    """
+def _bright_groups(panorama: Panorama) -> list[Bool[Tensor, "6 s s"]]:
+    """Find connected groups of pixels that a camera would clip; those on two faces that meet are joined."""
     srgb = srgb_from_linear(panorama.radiance)
     bright = (srgb.max(-1).values >= _CLIPPED) & (srgb.mean(-1) > _BRIGHTEST_MEAN)
     labels = np.zeros(bright.shape, np.int32)
@@ -163,13 +174,7 @@ def _bright_patches(panorama: Panorama, largest: float) -> tuple[list[LightSourc
         found, n = ndimage.label(bright[face].numpy(), structure=np.ones((3, 3)))  # pyright: ignore[reportGeneralTypeIssues]
         labels[face] = np.where(found > 0, found + count, 0)
         count += n
-    patches: list[_Patch] = []
-    for group in _joined([torch.from_numpy(labels == i) for i in range(1, count + 1)], panorama):
-        if _SMALLEST <= float(panorama.solid_angles[group].sum()) <= largest:
-            patches += _cut(panorama, group)
-    patches = sorted(patches, key=lambda patch: -patch.power)[:_MAX_PATCHES]
-    covered = sum((patch.pixels for patch in patches), torch.zeros_like(bright))
-    return [patch.source for patch in patches], covered
+    return _joined([torch.from_numpy(labels == i) for i in range(1, count + 1)], panorama)
 
 
 def _joined(groups: list[Bool[Tensor, "6 s s"]], panorama: Panorama) -> list[Bool[Tensor, "6 s s"]]:

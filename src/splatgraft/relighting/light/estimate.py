@@ -114,7 +114,7 @@ class EstimatedLight:
 
     @cached_property
     def _lit(self) -> Light:
-        """The mean with the sun, and with all of its ambient light dimmed alike."""
+        """The mean light with the sun; all of its ambient light is multiplied by one factor."""
         assert self.found_sun is not None
         changed = without_sun if self.is_shaded else with_sun
         return changed(self.mean, self.found_sun, is_added=self.sky is not None)

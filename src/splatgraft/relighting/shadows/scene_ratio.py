@@ -116,9 +116,9 @@ def _past_relief(surface: KnownSurface, normals: Float[Tensor, "m 3"], samples: 
     light from below (Estevez et al. 2019).
     """
     axis = rotation_from_quaternion(surface.quaternions)[:, :, 2]
-    tilt = (axis * normals).sum(1)  # its cosine, negative for an axis that points inwards
-    rough = (1 / tilt.abs().clamp(0.1, 1) ** 2 - 1) / 8
-    cosine = (tilt.sign()[:, None] * axis @ samples.directions.T).clamp(1e-4, 1)
+    aligned = (axis * normals).sum(1)  # cosine of the tilt, negative for an axis that points inwards
+    rough = (1 / aligned.abs().clamp(0.1, 1) ** 2 - 1) / 8
+    cosine = (aligned.sign()[:, None] * axis @ samples.directions.T).clamp(1e-4, 1)
     return 2 / (1 + (1 + rough[:, None] * (1 / cosine**2 - 1)).sqrt())
 
 
